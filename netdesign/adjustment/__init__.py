@@ -1,0 +1,1 @@
+"""Bundle adjustment and its comparison with the prediction."""

@@ -1,0 +1,1 @@
+"""Synthetic images and the measurement of tags in them."""

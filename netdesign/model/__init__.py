@@ -1,0 +1,1 @@
+"""Frozen values of the domain: numpy only, metres, radians and pixels."""

@@ -1,0 +1,211 @@
+"""The study file, key by key: the only place where defaults live.
+
+Keys carry their unit; ``files/study.py`` reads the TOML, resolves paths and converts to SI values.
+An unknown key, a wrong type or a value out of range is an error that names the table and the key.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Vector3 = tuple[Number, Number, Number]
+Range = tuple[Number, Number]
+
+
+class Table(BaseModel):
+    """A strict table: no unknown keys, frozen once read."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class PartTable(Table):
+    """[part]: the CAD mesh and its pose in the world frame."""
+
+    mesh: str = Field(description="path of any mesh trimesh reads, or package:// of an installed robot package")
+    unit: Literal["mm", "m", "inch"] = Field("mm", description="length unit of the mesh file")
+    position_mm: Vector3 = Field((0, 0, 0), description="origin of the mesh frame in the world frame")
+    rotation_deg: Vector3 = Field((0, 0, 0), description="roll, pitch, yaw of the mesh frame (URDF order)")
+
+
+class TargetsTable(Table):
+    """[targets]: AprilTags, in the mesh frame; from a file, or spread over the faces."""
+
+    family: Literal["tag36h11"] = "tag36h11"
+    size_mm: Positive = Field(description="edge of the black square")
+    file: str | None = Field(None, description="CSV: tag,x_mm,y_mm,z_mm,nx,ny,nz,ux,uy,uz")
+    spacing_mm: Positive | None = Field(None, description="instead of file: grid spacing of tags on every large face")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> "TargetsTable":
+        if (self.file is None) == (self.spacing_mm is None):
+            raise ValueError("expected exactly one of file and spacing_mm")
+        return self
+
+
+class CameraTable(Table):
+    """[camera]: interior orientation, optics, sensor, noise."""
+
+    width_px: Annotated[int, Field(gt=0, le=20000)]
+    height_px: Annotated[int, Field(gt=0, le=20000)]
+    focal_px: tuple[Positive, Positive]
+    principal_point_px: tuple[Number, Number]
+    distortion: tuple[Number, Number, Number, Number] = Field((0, 0, 0, 0), description="OpenCV's k1, k2, p1, p2")
+    pixel_um: Positive | None = Field(None, description="pixel pitch; with f_number and focus_mm: depth of field")
+    f_number: Positive | None = None
+    focus_mm: Positive | None = None
+    dof_blur_px: Positive = Field(2.0, description="largest circle of confusion that counts as sharp")
+    sigma_px: Positive = Field(0.1, description="image-coordinate noise per coordinate")
+    noise: Literal["constant", "detector"] = Field("constant", description="detector: the fitted model of the detector")
+    noise_file: str | None = Field(None, description="written by calibrate-noise; default: the shipped calibration")
+    blur_px: Positive = Field(0.7, description="Gaussian sigma of the optics")
+    full_well_e: Positive = Field(1500, description="electrons at white")
+    read_noise_e: NotNegative = 8
+
+
+class ViewpointsTable(Table):
+    """[viewpoints]: the viewing sphere."""
+
+    centre_mm: Vector3 = (0, 0, 0)
+    radius_mm: Positive
+    elevation_deg: Range = (10, 90)
+    azimuth_deg: Range = (-180, 180)
+    roll_deg: Number | Literal["free"] = Field(0, description="about the optical axis; free: the robot chooses")
+    max_images: Annotated[int, Field(ge=2, le=60)] = 16
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "ViewpointsTable":
+        for name, limit in (("elevation_deg", 90), ("azimuth_deg", 360)):
+            low, high = getattr(self, name)
+            if not (-limit <= low < high <= limit):
+                raise ValueError(f"{name}: expected low < high within ±{limit}, found [{low}, {high}]")
+        if self.azimuth_deg[1] - self.azimuth_deg[0] > 360:
+            raise ValueError("azimuth_deg: expected a range of at most 360")
+        return self
+
+
+class VisibilityTable(Table):
+    """[visibility]: when a tag counts as seen, and how much of it a network needs."""
+
+    max_incidence_deg: Annotated[float, Field(gt=0, lt=90)] = 65
+    min_tag_px: NotNegative = 25
+    border_px: NotNegative = 10
+    min_rays: Annotated[int, Field(ge=2)] = Field(3, description="images per object point")
+    min_points_per_image: Annotated[int, Field(ge=0)] = 8
+    occlusion: bool = True
+
+
+class Obstacle(Table):
+    """A box, axis-aligned in the world frame, that the robot must not touch."""
+
+    box_mm: tuple[Positive, Positive, Positive] = Field(description="edge lengths")
+    position_mm: Vector3 = Field(description="centre in the world frame")
+
+
+class RobotTable(Table):
+    """[robot]: the arm, its place, the camera on its flange, and how fast it moves."""
+
+    name: str | None = Field(None, description="a robot of example-robot-data: ur10, ur5, ur3, panda, xarm7, …")
+    urdf: str | None = Field(None, description="instead of name")
+    package_dirs: tuple[str, ...] = ()
+    tool_frame: str | None = Field(None, description="frame that carries the camera; default: the robot's flange")
+    base_position_mm: Vector3 = (-600, 0, 0)
+    base_rotation_deg: Vector3 = (0, 0, 0)
+    camera_mount: Literal["side", "coaxial"] = "side"
+    flange_from_cam_mm: tuple[tuple[Number, ...], ...] | None = Field(None, description="4x4, instead of camera_mount")
+    lock: dict[str, Number] = Field(default_factory=dict, description="joint name = value in rad, not moved")
+    limits_rad: dict[str, Range] = Field(default_factory=dict, description="joint name = [low, high], instead of URDF")
+    joint_weights: tuple[NotNegative, ...] | None = Field(None, description="lambda of the source paper; default all 1")
+    speed_rad_s: Positive = 1.05
+    acceleration_rad_s2: Positive = 1.4
+    dwell_s: NotNegative = 0.5
+    margin_mm: NotNegative = 20
+    obstacles: tuple[Obstacle, ...] = ()
+    repeatability_mm: NotNegative = Field(0, description="sigma of a robot position; 0: no pose priors")
+    repeatability_mrad: NotNegative = 0
+
+    @model_validator(mode="after")
+    def _one_robot(self) -> "RobotTable":
+        if (self.name is None) == (self.urdf is None):
+            raise ValueError("expected exactly one of name and urdf")
+        matrix = self.flange_from_cam_mm
+        if matrix is not None and [len(row) for row in matrix] != [4, 4, 4, 4]:
+            raise ValueError("flange_from_cam_mm: expected a 4x4 matrix")
+        return self
+
+
+class ObjectivesTable(Table):
+    """[objectives]: what is minimised."""
+
+    precision: Literal["mean_variance", "max_sigma"] = "mean_variance"
+    propagation: Literal["limited", "total"] = "limited"
+    motion: Literal["workspace", "joint", "time"] | None = Field(
+        None, description="default: joint with a robot, else workspace"
+    )
+
+
+class DistanceRequirement(Table):
+    """The expanded uncertainty (k = 2) of one distance between two object points."""
+
+    from_: str = Field(alias="from", description="tag.corner")
+    to: str
+    u95_um: Positive
+
+
+class RequirementsTable(Table):
+    """[requirements]: design to a tolerance."""
+
+    max_sigma_um: Positive | None = None
+    distances: tuple[DistanceRequirement, ...] = ()
+    max_images: Annotated[int, Field(ge=2)] | None = None
+    max_tour: Positive | None = Field(None, description="in the unit of f2: mm, rad or s")
+
+
+class SearchTable(Table):
+    """[search]: the engine and its budget, counted in evaluations, never in seconds."""
+
+    engine: Literal["memetic", "nsga2"] = Field("memetic", description="nsga2: the source paper's operators")
+    population: Annotated[int, Field(ge=4, le=10000)] = 200
+    generations: Annotated[int, Field(ge=1)] = 300
+    max_networks: Annotated[int, Field(ge=1)] = Field(40, description="networks of the front that are kept")
+
+
+class ValidationTable(Table):
+    """[validation]: how every network of the front is proved."""
+
+    datum: Literal["free"] = "free"
+    repeats: Annotated[int, Field(ge=1)] = 1
+    supersample: Annotated[int, Field(ge=1, le=8)] = 4
+    pose_jitter_mm: NotNegative = Field(1.0, description="robot pose error of the images: position, per axis")
+    pose_jitter_mrad: NotNegative = Field(5.0, description="robot pose error of the images: rotation, per axis")
+
+
+class Study(Table):
+    """A whole study file."""
+
+    format: Literal[1]
+    name: Annotated[str, Field(min_length=1)]
+    seed: Annotated[int, Field(ge=0)] = 1
+    part: PartTable
+    targets: TargetsTable
+    camera: CameraTable
+    viewpoints: ViewpointsTable
+    visibility: VisibilityTable = VisibilityTable()
+    robot: RobotTable | None = None
+    objectives: ObjectivesTable = ObjectivesTable()
+    requirements: RequirementsTable = RequirementsTable()
+    search: SearchTable = SearchTable()
+    validation: ValidationTable = ValidationTable()
+
+    @model_validator(mode="after")
+    def _motion_needs_a_robot(self) -> "Study":
+        if self.robot is None and self.objectives.motion in ("joint", "time"):
+            raise ValueError(f"objectives.motion: {self.objectives.motion} needs a [robot] table")
+        return self
+
+    @property
+    def motion(self) -> Literal["workspace", "joint", "time"]:
+        """The motion objective, its default resolved."""
+        return self.objectives.motion or ("workspace" if self.robot is None else "joint")

@@ -1,0 +1,1 @@
+"""Robot motion: kinematics, collision, tours."""

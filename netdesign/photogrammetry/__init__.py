@@ -1,0 +1,1 @@
+"""Kernels of photogrammetry: arrays in, arrays out."""

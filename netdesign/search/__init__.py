@@ -1,0 +1,1 @@
+"""Many-objective search on plain arrays; knows no camera."""

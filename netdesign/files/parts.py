@@ -1,0 +1,179 @@
+"""Parts and targets: meshes, tag lists, and tags spread over the faces of a mesh."""
+
+import csv
+import io
+import warnings
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from netdesign.errors import InputError
+from netdesign.model.arrays import Floats
+from netdesign.model.frames import transform
+from netdesign.model.scene import Part, Targets
+
+UNIT_M = {"mm": 1e-3, "m": 1.0, "inch": 0.0254}
+TAG_COLUMNS = ("tag", "x_mm", "y_mm", "z_mm", "nx", "ny", "nz", "ux", "uy", "uz")
+TAG_COUNT = {"tag36h11": 587}
+CELLS_PER_TAG = 8  # the black square of 36h11 is 8 cells wide; one white cell around it is the quiet zone
+
+
+def load_part(path: Path, unit: str, world_from_mesh: Floats) -> Part:
+    """Read a triangle mesh and place it in the world frame.
+
+    Args:
+        path: any mesh trimesh reads.  unit: mm, m or inch.  world_from_mesh: (4, 4), metres.
+
+    Raises:
+        InputError: missing, unreadable, without triangles, or with coordinates that are not finite.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such mesh (part.mesh)")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            mesh = trimesh.load(path, force="mesh", process=False)
+    except (ValueError, TypeError, KeyError, IndexError, ImportError, OSError, NotImplementedError) as error:
+        raise InputError(
+            f"{path}: expected a mesh, found {' '.join(str(error).split()) or type(error).__name__}"
+        ) from None
+    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+    if len(faces) == 0:
+        raise InputError(f"{path}: expected a mesh with triangles, found none")
+    broken = int((~np.isfinite(vertices).all(axis=1)).sum())
+    if broken:
+        raise InputError(f"{path}: expected finite coordinates, found {broken} vertices with NaN or infinity")
+    mesh.merge_vertices()
+    mesh.update_faces(mesh.nondegenerate_faces())
+    if len(mesh.faces) == 0:
+        raise InputError(f"{path}: expected a mesh with an area, found only degenerate triangles")
+    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+    if mesh.is_watertight and mesh.volume < 0:
+        faces = faces[:, ::-1]
+    return Part(vertices=transform(world_from_mesh, vertices * UNIT_M[unit]), faces=faces)
+
+
+def load_targets(path: Path, family: str, size_m: float, world_from_mesh: Floats) -> Targets:
+    """Read a list of tags (columns ``TAG_COLUMNS``, mesh frame) and place it in the world frame.
+
+    Raises:
+        InputError: with file and line: a column is missing, a number is not one, a tag id is repeated or outside the
+            family, a normal or x axis has no direction or the two are not at right angles (1 degree).
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file (targets.file)")
+    reader = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig")))
+    missing = [name for name in TAG_COLUMNS if name not in (reader.fieldnames or ())]
+    if missing:
+        raise InputError(f"{path}:1: expected columns {','.join(TAG_COLUMNS)}, found no {missing[0]}")
+    tags: dict[int, tuple[Floats, Floats, Floats]] = {}
+    for line in reader:
+        where = f"{path}:{reader.line_num}"
+        try:
+            tag, values = int(line["tag"]), np.array([float(line[name]) for name in TAG_COLUMNS[1:]])
+        except (TypeError, ValueError):
+            raise InputError(f"{where}: expected an integer and nine numbers, found {list(line.values())}") from None
+        if not 0 <= tag < TAG_COUNT[family]:
+            raise InputError(f"{where}: expected a tag id from 0 to {TAG_COUNT[family] - 1} of {family}, found {tag}")
+        if tag in tags:
+            raise InputError(f"{where}: tag {tag} stands in the list twice")
+        centre, normal, x_axis = values.reshape(3, 3)
+        lengths = np.linalg.norm([normal, x_axis], axis=1)
+        if not np.isfinite(values).all() or lengths.min() < 1e-6:
+            raise InputError(f"{where}: expected finite numbers and a direction, found {values.tolist()}")
+        normal, x_axis = normal / lengths[0], x_axis / lengths[1]
+        if abs(normal @ x_axis) > np.sin(np.radians(1.0)):
+            raise InputError(
+                f"{where}: expected the x axis at right angles to the normal, found tag {tag} off by more than 1 deg"
+            )
+        x_axis = x_axis - normal * (normal @ x_axis)
+        tags[tag] = centre, normal, x_axis / np.linalg.norm(x_axis)
+    if not tags:
+        raise InputError(f"{path}: expected at least one tag, found none")
+    centres, normals, x_axes = (np.array(column) for column in zip(*tags.values(), strict=True))
+    rotation = world_from_mesh[:3, :3]
+    return Targets(
+        ids=np.array(list(tags)),
+        centres=transform(world_from_mesh, centres * UNIT_M["mm"]),
+        normals=normals @ rotation.T,
+        x_axes=x_axes @ rotation.T,
+        size_m=size_m,
+        family=family,
+    )
+
+
+def spread_targets(part: Part, family: str, size_m: float, spacing_m: float) -> Targets:
+    """Put tags on a square grid on every flat face of the part that has room for them.
+
+    A flat face is a group of coplanar neighbouring triangles; a tag goes where the black square and its quiet zone of
+    one cell lie inside. Faces are taken from the largest to the smallest until the family has no more ids.
+
+    Raises:
+        InputError: no face has room for a tag, or the spacing is smaller than a tag with its quiet zone.
+    """
+    outer = size_m * (CELLS_PER_TAG + 2) / CELLS_PER_TAG
+    if spacing_m < outer:
+        raise InputError(
+            f"targets.spacing_mm: expected at least {outer * 1e3:g} (tag and quiet zone), found {spacing_m * 1e3:g}"
+        )
+    mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+    groups = [np.asarray(group) for group in mesh.facets] + [
+        np.array([face]) for face in np.setdiff1d(np.arange(len(mesh.faces)), np.concatenate([*mesh.facets, [-1]]))
+    ]
+    areas = np.array([mesh.area_faces[group].sum() for group in groups])
+    found: list[tuple[Floats, Floats, Floats]] = []
+    for index in np.argsort(-areas, kind="stable"):
+        if areas[index] < outer**2:
+            break
+        normal = np.asarray(mesh.face_normals[groups[index][0]])
+        found += [
+            (centre, normal, x_axis)
+            for centre, x_axis in _grid(part.triangles[groups[index]], normal, spacing_m, outer)
+        ]
+    found = found[: TAG_COUNT[family]]
+    if not found:
+        raise InputError(
+            f"targets.spacing_mm: no flat face of the part has room for a tag of {outer * 1e3:g} mm with its quiet zone; "
+            f"the largest flat face has {areas.max() * 1e6:.0f} mm²"
+        )
+    centres, normals, x_axes = (np.array(column) for column in zip(*found, strict=True))
+    return Targets(
+        ids=np.arange(len(found)), centres=centres, normals=normals, x_axes=x_axes, size_m=size_m, family=family
+    )
+
+
+def _grid(triangles: Floats, normal: Floats, spacing: float, outer: float) -> list[tuple[Floats, Floats]]:
+    """Return (centre, x axis) of the tags on one flat face (t, 3, 3), the grid centred on its bounding box."""
+    reference = np.array([0.0, 0, 1]) if abs(normal[2]) < 0.9 else np.array([0.0, 1, 0])
+    x_axis = np.cross(reference, normal)
+    x_axis = x_axis / np.linalg.norm(x_axis)
+    y_axis = np.cross(normal, x_axis)
+    flat = np.stack([triangles @ x_axis, triangles @ y_axis], axis=-1)
+    low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
+    counts = np.floor((high - low - outer) / spacing + 1e-9).astype(int) + 1
+    steps = [
+        (low[axis] + high[axis]) / 2 + (np.arange(max(counts[axis], 0)) - (counts[axis] - 1) / 2) * spacing
+        for axis in (0, 1)
+    ]
+    # Inside: a dense border of sample points, half a quiet cell apart, lies in the face; enough for convex notches.
+    ticks = np.linspace(-outer / 2, outer / 2, 21)
+    border = np.array([(x, y) for x in ticks for y in ticks])
+    height = float((triangles[0] @ normal).mean())
+    return [
+        (x * x_axis + y * y_axis + height * normal, x_axis)
+        for y in steps[1]
+        for x in steps[0]
+        if _covered(border + (x, y), flat)
+    ]
+
+
+def _covered(points: Floats, triangles: Floats) -> bool:
+    """Whether every point (p, 2) lies in one of the triangles (t, 3, 2)."""
+    start, end = triangles, np.roll(triangles, -1, axis=1)
+    edge = end - start
+    offset = points[:, None, None, :] - start
+    side = edge[..., 0] * offset[..., 1] - edge[..., 1] * offset[..., 0]
+    tolerance = 1e-9 * float(np.abs(edge).max()) ** 2
+    inside = (side >= -tolerance).all(axis=2) | (side <= tolerance).all(axis=2)
+    return bool(inside.any(axis=1).all())

@@ -158,9 +158,9 @@ def _camera(camera: pycolmap.Camera) -> Camera:
     return Camera(
         width_px=camera.width,
         height_px=camera.height,
-        focal_px=[fx, fy],
-        principal_point_px=[cx - PIXEL_ORIGIN, cy - PIXEL_ORIGIN],
-        distortion=distortion,
+        focal_px=np.array([fx, fy]),
+        principal_point_px=np.array([cx, cy]) - PIXEL_ORIGIN,
+        distortion=np.array(distortion),
     )
 
 

@@ -134,8 +134,8 @@ def spread_targets(part: Part, family: str, size_m: float, spacing_m: float) -> 
     found = found[: TAG_COUNT[family]]
     if not found:
         raise InputError(
-            f"targets.spacing_mm: no flat face of the part has room for a tag of {outer * 1e3:g} mm with its quiet zone; "
-            f"the largest flat face has {areas.max() * 1e6:.0f} mm²"
+            f"targets.spacing_mm: no flat face of the part has room for a tag of {outer * 1e3:g} mm with its quiet "
+            f"zone; the largest flat face has {areas.max() * 1e6:.0f} mm²"
         )
     centres, normals, x_axes = (np.array(column) for column in zip(*found, strict=True))
     return Targets(
@@ -164,7 +164,7 @@ def _grid(triangles: Floats, normal: Floats, spacing: float, outer: float) -> li
         (x * x_axis + y * y_axis + height * normal, x_axis)
         for y in steps[1]
         for x in steps[0]
-        if _covered(border + (x, y), flat)
+        if _covered(border + np.array([x, y]), flat)
     ]
 
 
@@ -175,5 +175,5 @@ def _covered(points: Floats, triangles: Floats) -> bool:
     offset = points[:, None, None, :] - start
     side = edge[..., 0] * offset[..., 1] - edge[..., 1] * offset[..., 0]
     tolerance = 1e-9 * float(np.abs(edge).max()) ** 2
-    inside = (side >= -tolerance).all(axis=2) | (side <= tolerance).all(axis=2)
-    return bool(inside.any(axis=1).all())
+    inside = np.all(side >= -tolerance, axis=2) | np.all(side <= tolerance, axis=2)
+    return bool(np.all(np.any(inside, axis=1)))

@@ -26,7 +26,8 @@ def inverse(a_from_b: Floats) -> Floats:
 
 def transform(a_from_b: Floats, points: Floats) -> Floats:
     """Return points (…, 3) of frame b expressed in frame a."""
-    return np.einsum("...ij,...j->...i", a_from_b[..., :3, :3], points) + a_from_b[..., :3, 3]
+    rotated: Floats = np.einsum("...ij,...j->...i", a_from_b[..., :3, :3], points)
+    return rotated + a_from_b[..., :3, 3]
 
 
 def rotation_from_rpy(roll_pitch_yaw: Floats) -> Floats:

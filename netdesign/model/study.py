@@ -18,7 +18,7 @@ Range = tuple[Number, Number]
 class Table(BaseModel):
     """A strict table: no unknown keys, frozen once read."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
 
 class PartTable(Table):

@@ -1,0 +1,106 @@
+"""The [robot] table: from names and paths to a RobotCell, and a user's URDF packed into the run directory."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from netdesign.errors import InputError
+from netdesign.files.packages import resolve_path, share_folder
+from netdesign.model.arrays import Floats
+from netdesign.model.frames import pose, rotation_from_rpy
+from netdesign.model.study import RobotTable
+from netdesign.model.task import RobotCell
+
+MM = 1e-3
+MESH_ATTRIBUTE = re.compile(r'<mesh[^>]*\bfilename="([^"]+)"')
+
+
+def resolve_cell(table: RobotTable, folder: Path) -> RobotCell:
+    """Return the robot cell in SI units.
+
+    Args:
+        table: the [robot] table.  folder: where its relative paths start.
+
+    Raises:
+        InputError: unknown robot name, missing URDF, or a flange_from_cam_mm that is not a rigid transform.
+    """
+    from netdesign.motion.robot import find_robot, mount  # pinocchio is only loaded for studies with a robot
+
+    if table.name is not None:
+        robot = find_robot(table.name)
+        name, urdf, package_dirs, tool_frame = table.name, robot.urdf, robot.package_dirs, robot.tool_frame
+    else:
+        urdf = _urdf(table, folder)
+        name, tool_frame = urdf.stem, None
+        package_dirs = (*(resolve_path(entry, folder) for entry in table.package_dirs), share_folder())
+    flange_from_cam = mount(table.camera_mount)
+    if table.flange_from_cam_mm is not None:
+        flange_from_cam = _rigid(np.array(table.flange_from_cam_mm, dtype=np.float64))
+    boxes = table.obstacles
+    return RobotCell(
+        name=name,
+        urdf=urdf,
+        package_dirs=tuple(package_dirs),
+        tool_frame=table.tool_frame or tool_frame,
+        world_from_base=pose(
+            rotation_from_rpy(np.radians(table.base_rotation_deg)), np.array(table.base_position_mm) * MM
+        ),
+        flange_from_cam=flange_from_cam,
+        lock=dict(table.lock),
+        limits={joint: (low, high) for joint, (low, high) in table.limits_rad.items()},
+        joint_weights=table.joint_weights,
+        speed=table.speed_rad_s,
+        acceleration=table.acceleration_rad_s2,
+        dwell=table.dwell_s,
+        margin=table.margin_mm * MM,
+        obstacle_centres=np.array([box.position_mm for box in boxes]).reshape(-1, 3) * MM,
+        obstacle_sizes=np.array([box.box_mm for box in boxes]).reshape(-1, 3) * MM,
+        repeatability=(table.repeatability_mm * MM, table.repeatability_mrad * MM),
+    )
+
+
+def bundle_robot(table: RobotTable, folder: Path) -> tuple[RobotTable, dict[str, bytes]]:
+    """Return the table with paths into inputs/robot, and the files to put there; a robot by name needs none.
+
+    Raises:
+        InputError: the URDF or a mesh that it names is missing.
+    """
+    if table.urdf is None:
+        return table, {}
+    urdf = _urdf(table, folder)
+    packages = [resolve_path(entry, folder) for entry in table.package_dirs]
+    files = {"inputs/robot/robot.urdf": urdf.read_bytes()}
+    for name in sorted(set(MESH_ATTRIBUTE.findall(urdf.read_text(encoding="utf-8")))):
+        if name.startswith("package://"):
+            below = name.removeprefix("package://")
+            found = [package / below for package in packages if (package / below).is_file()]
+            if found:
+                files[f"inputs/robot/packages/{below}"] = found[0].read_bytes()
+            elif not (share_folder() / below).is_file():
+                raise InputError(f"{urdf}: mesh {name} is in none of robot.package_dirs")
+        elif (urdf.parent / name).is_file():
+            files[f"inputs/robot/{Path(name).as_posix()}"] = (urdf.parent / name).read_bytes()
+        else:
+            raise InputError(f"{urdf}: mesh {name}: no such file")
+    update = {"urdf": "inputs/robot/robot.urdf", "package_dirs": ("inputs/robot/packages",) if packages else ()}
+    return table.model_copy(update=update), files
+
+
+def _urdf(table: RobotTable, folder: Path) -> Path:
+    urdf = resolve_path(str(table.urdf), folder)
+    if not urdf.is_file():
+        raise InputError(f"{urdf}: no such file (robot.urdf)")
+    return urdf
+
+
+def _rigid(matrix: Floats) -> Floats:
+    """Return a 4x4 transform in mm as metres after its rotation has been checked."""
+    rotation = matrix[:3, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > 1e-6 or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise InputError(
+            f"robot.flange_from_cam_mm: expected a right-handed rotation and a last row 0 0 0 1, "
+            f"found R R^T off the identity by {error:.2g}, determinant {np.linalg.det(rotation):.3g}"
+        )
+    return pose(rotation, matrix[:3, 3] * MM)

@@ -28,8 +28,7 @@ def resolve_cell(table: RobotTable, folder: Path) -> RobotCell:
     from netdesign.motion.robot import find_robot, mount  # pinocchio is only loaded for studies with a robot
 
     if table.name is not None:
-        robot = find_robot(table.name)
-        name, urdf, package_dirs, tool_frame = table.name, robot.urdf, robot.package_dirs, robot.tool_frame
+        name, (urdf, package_dirs, tool_frame) = table.name, find_robot(table.name)
     else:
         urdf = _urdf(table, folder)
         name, tool_frame = urdf.stem, None

@@ -69,6 +69,7 @@ class RobotCell:
         obstacle_centres, obstacle_sizes: (b, 3) m, world-axis-aligned boxes.
         margin: m, distance the robot keeps from everything that is not itself.
         repeatability: sigma of the flange pose, (position m, rotation rad).
+        camera_radius, camera_length: m, the camera's body: a rounded cylinder behind the perspective centre.
     """
 
     name: str
@@ -87,6 +88,8 @@ class RobotCell:
     obstacle_centres: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     obstacle_sizes: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     repeatability: tuple[float, float] = (0.0, 0.0)
+    camera_radius: float = 0.03
+    camera_length: float = 0.09
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "world_from_base", frozen("world_from_base", self.world_from_base, (4, 4)))

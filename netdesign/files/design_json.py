@@ -1,0 +1,141 @@
+"""RUN/design.json: the front, written from a Design and read back as plain networks."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from netdesign.errors import InputError
+from netdesign.files.store import read_json, write_json
+from netdesign.model.arrays import Floats, frozen
+from netdesign.model.results import Design, DesignedNetwork, PointPrecision
+from netdesign.model.task import Task
+
+MM, UM = 1e-3, 1e-6
+F1 = {"mean_variance": ("mean_variance", "mm^2", MM**2), "max_sigma": ("max_sigma", "um", UM)}
+F2 = {"workspace": ("tour_workspace", "mm", MM), "joint": ("tour_joint", "rad", 1.0), "time": ("tour_time", "s", 1.0)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedNetwork:
+    """One network as design.json holds it, in SI units and visiting order.
+
+    Attributes:
+        viewpoints: (n, 2) rad.  world_from_cam: (n, 4, 4) m.  joints: (n, r) rad or None.
+    """
+
+    id: int
+    viewpoints: Floats
+    world_from_cam: Floats
+    joints: Floats | None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "viewpoints", frozen("viewpoints", self.viewpoints, ("n", 2)))
+        object.__setattr__(
+            self, "world_from_cam", frozen("world_from_cam", self.world_from_cam, (len(self.viewpoints), 4, 4))
+        )
+
+
+def write_design(path: Path, task: Task, design: Design) -> None:
+    """Write the front; lengths in mm, sigmas in um, angles in deg where the key says so."""
+    objectives = task.study.objectives
+    f1_name, f1_unit, f1_scale = F1[objectives.precision]
+    f2_name, f2_unit, f2_scale = F2[task.study.motion]
+    targets = task.scene.targets
+    payload = {
+        "name": task.study.name,
+        "seed": task.study.seed,
+        "objectives": [
+            {"name": f1_name, "unit": f1_unit, "propagation": objectives.propagation},
+            {"name": f2_name, "unit": f2_unit},
+            {"name": "images", "unit": "1"},
+        ],
+        "points": [
+            {"id": name, "xyz_mm": xyz / MM, "normal": normal}
+            for name, xyz, normal in zip(targets.point_ids, targets.points, targets.point_normals, strict=True)
+        ],
+        "camera": _camera(task),
+        "history": {"evaluations": design.history.evaluations, "hypervolume": design.history.hypervolume},
+        "bounds": [{"images": size, "f1_mm2": bound / MM**2} for size, bound in sorted(design.bounds.items())],
+        "notes": list(design.notes),
+        "networks": [
+            _network(number, network, (f1_scale, f2_scale)) for number, network in enumerate(design.networks)
+        ],
+    }
+    write_json(path, "design", payload, task.sha256)
+
+
+def read_networks(run: Path) -> dict[int, PlannedNetwork]:
+    """Return the networks of RUN/design.json by id.
+
+    Raises:
+        InputError: there is no design.json, or it is not one.
+    """
+    content = read_json(run / "design.json", "design")
+    networks = {}
+    for entry in content["networks"]:
+        world_from_cam = np.array(entry["world_from_cam_mm"], dtype=np.float64)
+        world_from_cam[:, :3, 3] *= MM
+        networks[int(entry["id"])] = PlannedNetwork(
+            id=int(entry["id"]),
+            viewpoints=np.radians(entry["viewpoints_deg"]),
+            world_from_cam=world_from_cam,
+            joints=None if entry["joints_rad"] is None else np.array(entry["joints_rad"]),
+        )
+    return networks
+
+
+def find_network(run: Path, number: int) -> PlannedNetwork:
+    """Return one network of RUN/design.json.
+
+    Raises:
+        InputError: there is no such network; the message says which there are.
+    """
+    networks = read_networks(run)
+    if number not in networks:
+        raise InputError(f"--network: expected an id from 0 to {len(networks) - 1} of {run}, found {number}")
+    return networks[number]
+
+
+def _network(number: int, network: DesignedNetwork, scales: tuple[float, float]) -> dict[str, Any]:
+    world_from_cam_mm = network.world_from_cam.copy()
+    world_from_cam_mm[:, :3, 3] /= MM
+    total = network.total
+    return {
+        "id": number,
+        "objectives": [network.f1 / scales[0], network.f2 / scales[1], network.f3],
+        "viewpoints_deg": np.degrees(network.viewpoints),
+        "world_from_cam_mm": world_from_cam_mm,
+        "joints_rad": network.tour.joints,
+        "rms_sigma_um": _rms_um(network.precision),
+        "max_sigma_um": float(network.precision.sigma.max()) / UM,
+        "datum": network.precision.datum,
+        "total_rms_sigma_um": None if total is None else _rms_um(total),
+        "total_max_sigma_um": None if total is None else float(total.sigma.max()) / UM,
+        "total_datum": None if total is None else total.datum,
+        "bound_ratio": network.bound_ratio,
+        "rays": network.precision.rays,
+        "sigma_um": network.precision.sigma / UM,
+        "total_sigma_um": None if total is None else total.sigma / UM,
+        "warnings": list(network.warnings),
+    }
+
+
+def _rms_um(precision: PointPrecision) -> float:
+    return float(np.sqrt(precision.mean_variance)) / UM
+
+
+def _camera(task: Task) -> dict[str, Any]:
+    camera = task.camera
+    return {
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        "focal_px": camera.focal_px,
+        "principal_point_px": camera.principal_point_px,
+        "distortion": camera.distortion,
+        "sigma_px": camera.sigma_px,
+        "corner_noise": None
+        if camera.corner_noise is None
+        else {"k": camera.corner_noise.k, "floor_px": camera.corner_noise.floor_px},
+    }

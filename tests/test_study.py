@@ -1,0 +1,145 @@
+"""Study files: every mistake is one line that says where, what was expected and what was found."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from netdesign.errors import InputError
+from netdesign.files.study import load_task, resolve, write_resolved
+
+STUDY = """format = 1
+name = "box"
+[part]
+mesh = "box.stl"
+[targets]
+size_mm = 20.0
+spacing_mm = 45
+[camera]
+width_px = 2448
+height_px = 2048
+focal_px = [3600, 3600]
+principal_point_px = [1223.5, 1023.5]
+[viewpoints]
+radius_mm = 600
+"""
+
+
+@pytest.fixture
+def study(tmp_path):
+    """A function that writes a study with one text replaced, beside a box of 200 x 150 x 100 mm."""
+    trimesh.creation.box((200, 150, 100)).export(tmp_path / "box.stl")
+
+    def write(old="", new=""):
+        assert old in STUDY
+        path = tmp_path / "study.toml"
+        path.write_text(STUDY.replace(old, new) if old else STUDY)
+        return path
+
+    return write
+
+
+def test_units_are_converted_once(study):
+    task = load_task(study())
+    np.testing.assert_allclose(np.ptp(task.scene.part.vertices, axis=0), [0.2, 0.15, 0.1])
+    assert task.sphere.radius == pytest.approx(0.6)
+    assert task.limits.max_incidence == pytest.approx(np.radians(65))
+    edges = np.diff(task.scene.targets.points.reshape(-1, 4, 3), axis=1)
+    np.testing.assert_allclose(np.linalg.norm(edges, axis=2), 0.02, rtol=1e-12)
+
+
+def test_inch_and_pose(study):
+    task = load_task(
+        study('mesh = "box.stl"', 'mesh = "box.stl"\nunit = "mm"\nposition_mm = [0, 0, 50]\nrotation_deg = [0, 0, 90]')
+    )
+    np.testing.assert_allclose(task.scene.part.vertices.min(axis=0), [-0.075, -0.1, 0.0], atol=1e-12)
+
+
+def test_tags_lie_on_faces_and_do_not_overlap(study):
+    task = load_task(study())
+    targets, half = task.scene.targets, np.array([0.1, 0.075, 0.05])
+    heights = np.abs(np.einsum("gi,gi->g", targets.centres, targets.normals))
+    np.testing.assert_allclose(heights, np.abs(targets.normals) @ half, atol=1e-12)
+    distances = np.linalg.norm(targets.centres[:, None] - targets.centres, axis=2) + np.eye(len(targets.ids))
+    assert distances.min() > 0.025
+    assert np.all(np.abs(targets.points) <= half + 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("radius_mm", "radius", r"viewpoints\.radius: unknown key, the nearest known key is 'radius_mm'"),
+        ("[viewpoints]", "[viewpoint]", r"viewpoint: unknown key, the nearest known key is 'viewpoints'"),
+        ("box.stl", "none.stl", r"none\.stl: no such file"),
+        ("[3600, 3600]", "[0, 3600]", r"camera\.focal_px\.0: expected greater than 0, found 0"),
+        ("[3600, 3600]", "[nan, 3600]", r"camera\.focal_px"),
+        ("spacing_mm = 45\n", "", r"exactly one of file and spacing_mm"),
+        ("spacing_mm = 45", "spacing_mm = 10", r"spacing_mm: expected at least 25"),
+        ("size_mm = 20.0", "size_mm = 200.0\nspacing_mm=300\n#", r"no flat face of the part has room"),
+        ("radius_mm = 600", "radius_mm = 100", r"radius_mm: expected more than the part's reach of 134\.6 mm"),
+        ("radius_mm = 600", "radius_mm = 600\nelevation_deg = [50, 20]", r"elevation_deg: expected low < high"),
+        ("format = 1", "format = 2", r"format: expected 1, found 2"),
+        ("format = 1", "format = ", r"expected TOML"),
+        ('name = "box"', "", r"name: expected a value, found none"),
+        ("[camera]", '[objectives]\nmotion = "joint"\n[camera]', r"joint needs a \[robot\] table"),
+    ],
+)
+def test_mistakes(study, old, new, says):
+    text = new.replace("spacing_mm=300\n#", "") if "spacing_mm=300" in new else new
+    path = study(old, text)
+    if "200.0" in new:
+        path.write_text(path.read_text().replace("spacing_mm = 45", "spacing_mm = 300"))
+    with pytest.raises(InputError, match=says) as caught:
+        load_task(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("vertices", [[[0, 0, 0], [1, 0, 0], [np.nan, 1, 0]], [[0, 0, 0], [1, 0, 0], [2, 0, 0]]])
+def test_broken_meshes(study, tmp_path, vertices):
+    mesh = trimesh.Trimesh(vertices=vertices, faces=[[0, 1, 2]], process=False)
+    (tmp_path / "box.stl").write_bytes(trimesh.exchange.stl.export_stl(mesh))
+    with pytest.raises(InputError, match=r"box\.stl: expected"):
+        load_task(study())
+
+
+def test_not_a_mesh(study, tmp_path):
+    (tmp_path / "box.stl").write_text("hello")
+    with pytest.raises(InputError, match=r"box\.stl: expected a mesh"):
+        load_task(study())
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("1,0,0,50,0,0,1,1,0", "integer and nine numbers"),
+        ("600,0,0,50,0,0,1,1,0,0", "tag id from 0 to 586"),
+        ("0,0,0,50,0,0,0,1,0,0", "a direction"),
+        ("0,0,0,50,0,0,1,0,1,1", "right angles"),
+        ("0,0,0,50,0,0,1,1,0,0\n0,30,0,50,0,0,1,1,0,0", "twice"),
+        ("", "at least one tag"),
+    ],
+)
+def test_wrong_tag_lists(study, tmp_path, line, says):
+    (tmp_path / "tags.csv").write_text(f"tag,x_mm,y_mm,z_mm,nx,ny,nz,ux,uy,uz\n{line}\n")
+    with pytest.raises(InputError, match=says):
+        load_task(study("spacing_mm = 45", 'file = "tags.csv"'))
+
+
+def test_a_resolved_run_can_be_moved(study, tmp_path):
+    path = study()
+    first = resolve(path)
+    run = tmp_path / "run"
+    write_resolved(first, run)
+    moved = tmp_path / "elsewhere"
+    run.rename(moved)
+    second = resolve(moved / "study.toml")
+    assert second.text == first.text
+    assert second.sha256 == first.sha256
+    assert load_task(moved / "study.toml").sha256 == first.sha256
+    assert str(tmp_path) not in (moved / "study.toml").read_text()
+
+
+def test_the_hash_follows_the_inputs(study, tmp_path):
+    before = resolve(study()).sha256
+    trimesh.creation.box((200, 150, 101)).export(tmp_path / "box.stl")
+    assert resolve(study()).sha256 != before
+    assert resolve(study(), seed=7).sha256 != resolve(study()).sha256

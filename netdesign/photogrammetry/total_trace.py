@@ -1,0 +1,256 @@
+"""The trace of the total covariance as a search criterion: compiled, no (3m, 3m) matrix, no Python objects.
+
+Same quantity as ``total_error.total_covariance(...).trace`` for free poses and known interior orientation:
+
+    trace Σ = tr D - tr QᵀDQ + tr S⁻ (BᵀB - UUᵀ),   U = BᵀQ
+
+S⁻ comes from the Cholesky factor of the Jacobi-scaled S bordered by the datum's null space; a pivot that vanishes
+means an undetermined network and gives inf.
+"""
+
+import numpy as np
+from numba import njit
+
+from netdesign.model.arrays import Bools, Floats
+
+PIVOT = 1e-12  # of the scaled normal matrix with unit diagonal: below it the network is not determined
+
+
+@njit(cache=True, error_model="numpy")
+def total_trace(
+    world_from_cam: Floats, points: Floats, intrinsics: Floats, visible: Bools, sigma_px: Floats, basis: Floats
+) -> float:
+    """Return the trace (m²) of the joint covariance, inner constraints over all points; inf when not determined.
+
+    Args:
+        world_from_cam: (n, 4, 4) m.  points: (m, 3) m.  intrinsics: (8,).
+        visible: (n, m).  sigma_px: (n, m) or (1, 1) for one sigma.
+        basis: (3m, 7) from ``datum.inner_basis(points)``, once per object.
+    """
+    images, count = visible.shape
+    width = 6 * images
+    schur = np.zeros((width, width))
+    spread = np.zeros((width, width))  # BᵀB
+    turned = np.zeros((width, 7))  # U
+    gauge_part = np.zeros((7, 7))  # QᵀDQ
+    scale = np.zeros(width)
+    cross = np.zeros((images, 3, 6))
+    solved = np.zeros((images, 3, 6))
+    seen = np.zeros(images, dtype=np.int64)
+    pose = np.zeros((2, 6))
+    point = np.zeros((2, 3))
+    inverse = np.zeros((3, 3))
+    one_sigma = sigma_px.shape[0] == 1 and sigma_px.shape[1] == 1
+    trace = 0.0
+    for j in range(count):
+        rays = 0
+        n00 = n01 = n02 = n11 = n12 = n22 = 0.0
+        for i in range(images):
+            if not visible[i, j]:
+                continue
+            sigma = sigma_px[0, 0] if one_sigma else sigma_px[i, j]
+            if not _derivatives(world_from_cam[i], points[j], intrinsics, 1.0 / sigma, pose, point):
+                return np.inf
+            seen[rays] = i
+            for a in range(3):
+                for b in range(6):
+                    cross[rays, a, b] = point[0, a] * pose[0, b] + point[1, a] * pose[1, b]
+            for a in range(6):
+                for b in range(a + 1):
+                    schur[6 * i + a, 6 * i + b] += pose[0, a] * pose[0, b] + pose[1, a] * pose[1, b]
+            n00 += point[0, 0] ** 2 + point[1, 0] ** 2
+            n01 += point[0, 0] * point[0, 1] + point[1, 0] * point[1, 1]
+            n02 += point[0, 0] * point[0, 2] + point[1, 0] * point[1, 2]
+            n11 += point[0, 1] ** 2 + point[1, 1] ** 2
+            n12 += point[0, 1] * point[0, 2] + point[1, 1] * point[1, 2]
+            n22 += point[0, 2] ** 2 + point[1, 2] ** 2
+            rays += 1
+        c00, c01, c02 = n11 * n22 - n12 * n12, n02 * n12 - n01 * n22, n01 * n12 - n02 * n11
+        determinant = n00 * c00 + n01 * c01 + n02 * c02
+        size = (n00 + n11 + n22) / 3.0
+        if rays < 2 or not determinant > 1e-12 * size**3:
+            return np.inf
+        inverse[0, 0], inverse[0, 1], inverse[0, 2] = c00 / determinant, c01 / determinant, c02 / determinant
+        inverse[1, 1], inverse[1, 2] = (n00 * n22 - n02 * n02) / determinant, (n01 * n02 - n00 * n12) / determinant
+        inverse[2, 2] = (n00 * n11 - n01 * n01) / determinant
+        inverse[1, 0], inverse[2, 0], inverse[2, 1] = inverse[0, 1], inverse[0, 2], inverse[1, 2]
+        trace += inverse[0, 0] + inverse[1, 1] + inverse[2, 2]
+        for a in range(7):
+            for b in range(7):
+                value = 0.0
+                for r in range(3):
+                    for c in range(3):
+                        value += basis[3 * j + r, a] * inverse[r, c] * basis[3 * j + c, b]
+                gauge_part[a, b] += value
+        for k in range(rays):
+            for a in range(3):
+                for b in range(6):
+                    solved[k, a, b] = (
+                        inverse[a, 0] * cross[k, 0, b] + inverse[a, 1] * cross[k, 1, b] + inverse[a, 2] * cross[k, 2, b]
+                    )
+            for b in range(6):
+                row = 6 * seen[k] + b
+                for g in range(7):
+                    turned[row, g] += (
+                        solved[k, 0, b] * basis[3 * j, g]
+                        + solved[k, 1, b] * basis[3 * j + 1, g]
+                        + solved[k, 2, b] * basis[3 * j + 2, g]
+                    )
+        for k in range(rays):
+            for other in range(k + 1):
+                for a in range(6):
+                    row = 6 * seen[k] + a
+                    for b in range(a + 1 if other == k else 6):
+                        column = 6 * seen[other] + b
+                        schur[row, column] -= (
+                            cross[k, 0, a] * solved[other, 0, b]
+                            + cross[k, 1, a] * solved[other, 1, b]
+                            + cross[k, 2, a] * solved[other, 2, b]
+                        )
+                        spread[row, column] += (
+                            solved[k, 0, a] * solved[other, 0, b]
+                            + solved[k, 1, a] * solved[other, 1, b]
+                            + solved[k, 2, a] * solved[other, 2, b]
+                        )
+    for g in range(7):
+        trace -= gauge_part[g, g]
+    gauge = _gauge(world_from_cam, points)
+    for a in range(width):
+        scale[a] = 1.0 / np.sqrt(schur[a, a]) if schur[a, a] > 0 else 0.0
+        if scale[a] == 0.0:
+            return np.inf
+    if not _orthonormalise(gauge, scale):
+        return np.inf
+    for a in range(width):
+        for b in range(a + 1):
+            schur[a, b] *= scale[a] * scale[b]
+            for g in range(7):
+                schur[a, b] += gauge[a, g] * gauge[b, g]
+                spread[a, b] -= turned[a, g] * turned[b, g]
+            spread[a, b] *= scale[a] * scale[b]
+    if not _invert(schur):
+        return np.inf
+    for a in range(width):
+        trace += schur[a, a] * spread[a, a]
+        for b in range(a):
+            trace += 2.0 * schur[a, b] * spread[a, b]
+    return trace if trace > 0 else np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def _derivatives(
+    world_from_cam: Floats, x: Floats, intrinsics: Floats, weight: float, pose: Floats, point: Floats
+) -> bool:
+    """Write the whitened derivatives of one image point to ``pose`` (2, 6) and ``point`` (2, 3); False if behind."""
+    d0, d1, d2 = x[0] - world_from_cam[0, 3], x[1] - world_from_cam[1, 3], x[2] - world_from_cam[2, 3]
+    q0 = world_from_cam[0, 0] * d0 + world_from_cam[1, 0] * d1 + world_from_cam[2, 0] * d2
+    q1 = world_from_cam[0, 1] * d0 + world_from_cam[1, 1] * d1 + world_from_cam[2, 1] * d2
+    q2 = world_from_cam[0, 2] * d0 + world_from_cam[1, 2] * d1 + world_from_cam[2, 2] * d2
+    if not q2 > 0:
+        return False
+    k1, k2, p1, p2 = intrinsics[4], intrinsics[5], intrinsics[6], intrinsics[7]
+    u, v, inverse_depth = q0 / q2, q1 / q2, 1.0 / q2
+    r2 = u * u + v * v
+    radial, slope = 1.0 + r2 * (k1 + k2 * r2), 2.0 * (k1 + 2.0 * k2 * r2)
+    mixed = u * v * slope + 2.0 * p1 * u + 2.0 * p2 * v
+    fx, fy = intrinsics[0] * weight * inverse_depth, intrinsics[1] * weight * inverse_depth
+    a00, a01 = fx * (radial + u * u * slope + 2.0 * p1 * v + 6.0 * p2 * u), fx * mixed
+    a10, a11 = fy * mixed, fy * (radial + v * v * slope + 6.0 * p1 * v + 2.0 * p2 * u)
+    for row in range(2):
+        g0, g1 = (a00, a01) if row == 0 else (a10, a11)
+        g2 = -(g0 * u + g1 * v)
+        pose[row, 0] = g1 * q2 - g2 * q1
+        pose[row, 1] = g2 * q0 - g0 * q2
+        pose[row, 2] = g0 * q1 - g1 * q0
+        pose[row, 3], pose[row, 4], pose[row, 5] = -g0, -g1, -g2
+        for axis in range(3):
+            point[row, axis] = (
+                g0 * world_from_cam[axis, 0] + g1 * world_from_cam[axis, 1] + g2 * world_from_cam[axis, 2]
+            )
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _gauge(world_from_cam: Floats, points: Floats) -> Floats:
+    """Return the camera rows (6n, 7) of the datum's null space about the points' centroid."""
+    images, count = world_from_cam.shape[0], points.shape[0]
+    centre = np.zeros(3)
+    for j in range(count):
+        for axis in range(3):
+            centre[axis] += points[j, axis] / count
+    gauge = np.zeros((6 * images, 7))
+    for i in range(images):
+        t0, t1, t2 = (
+            world_from_cam[i, 0, 3] - centre[0],
+            world_from_cam[i, 1, 3] - centre[1],
+            world_from_cam[i, 2, 3] - centre[2],
+        )
+        for a in range(3):
+            r0, r1, r2 = world_from_cam[i, 0, a], world_from_cam[i, 1, a], world_from_cam[i, 2, a]
+            row = 6 * i + a
+            gauge[row, 3], gauge[row, 4], gauge[row, 5] = r0, r1, r2
+            row += 3
+            gauge[row, 0], gauge[row, 1], gauge[row, 2] = r0, r1, r2
+            gauge[row, 3], gauge[row, 4], gauge[row, 5] = r2 * t1 - r1 * t2, r0 * t2 - r2 * t0, r1 * t0 - r0 * t1
+            gauge[row, 6] = r0 * t0 + r1 * t1 + r2 * t2
+    for g in range(7):  # comparable columns before the orthogonalisation
+        size = np.sqrt((gauge[:, g] ** 2).sum())
+        if size > 0:
+            gauge[:, g] /= size
+    return gauge
+
+
+@njit(cache=True, error_model="numpy")
+def _orthonormalise(gauge: Floats, scale: Floats) -> bool:
+    """Divide the rows by ``scale`` and make the columns orthonormal in place (Gram-Schmidt, twice)."""
+    width = gauge.shape[0]
+    for a in range(width):
+        for g in range(7):
+            gauge[a, g] /= scale[a]
+    for g in range(7):
+        before = np.sqrt((gauge[:, g] ** 2).sum())
+        for _ in range(2):
+            for h in range(g):
+                product = 0.0
+                for a in range(width):
+                    product += gauge[a, g] * gauge[a, h]
+                for a in range(width):
+                    gauge[a, g] -= product * gauge[a, h]
+        size = np.sqrt((gauge[:, g] ** 2).sum())
+        if not size > 1e-10 * before:
+            return False
+        for a in range(width):
+            gauge[a, g] /= size
+    return True
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
+def _invert(matrix: Floats) -> bool:
+    """Replace the lower triangle of a positive definite matrix by that of its inverse; False if a pivot vanishes."""
+    width = matrix.shape[0]
+    for j in range(width):
+        for i in range(j, width):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= matrix[i, k] * matrix[j, k]
+            if i == j:
+                if not value > PIVOT:
+                    return False
+                matrix[j, j] = np.sqrt(value)
+            else:
+                matrix[i, j] = value / matrix[j, j]
+    factor = np.zeros((width, width))  # L⁻¹ transposed: rows contiguous in the sums below
+    for j in range(width):
+        factor[j, j] = 1.0 / matrix[j, j]
+        for i in range(j + 1, width):
+            value = 0.0
+            for k in range(j, i):
+                value -= matrix[i, k] * factor[j, k]
+            factor[j, i] = value / matrix[i, i]
+    for i in range(width):
+        for j in range(i + 1):
+            value = 0.0
+            for k in range(i, width):
+                value += factor[i, k] * factor[j, k]
+            matrix[i, j] = value
+    return True

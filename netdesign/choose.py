@@ -7,15 +7,16 @@ from typing import Any
 import numpy as np
 
 from netdesign.errors import InputError
-from netdesign.files.store import read_json
+from netdesign.files.store import plain, read_json
 from netdesign.files.study import load_task
 from netdesign.model.arrays import Floats
-from netdesign.model.study import DistanceRequirement, Study
 from netdesign.model.task import Task
-from netdesign.placement.decide import Requirement, admissible, cheapest, knee
+from netdesign.placement import decide
+from netdesign.placement.decide import Requirement
 from netdesign.placement.distances import distance_u95
 
 MM = 1e-3
+SIGMA = "largest point sigma"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,12 +55,27 @@ class Choice:
     requirements: tuple[dict[str, Any], ...]
     warnings: tuple[str, ...]
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return what ``--json`` prints."""
-        return asdict(self)
+    @property
+    def record(self) -> dict[str, Any]:
+        """What ``--json`` prints."""
+        return plain(asdict(self))  # type: ignore[no-any-return]
+
+    @property
+    def text(self) -> str:
+        """What a person reads: the reason, then the warnings, a line each."""
+        return "\n".join([self.reason[0].upper() + self.reason[1:], *(f"warning: {item}" for item in self.warnings)])
 
 
-def front(run: Path) -> list[FrontRow]:
+def front(run: Path) -> list[dict[str, Any]]:
+    """Return the front of a run as flat records with the keys of ``FrontRow``.
+
+    Raises:
+        InputError: RUN/design.json is missing or not a design.
+    """
+    return [plain(asdict(row)) for row in front_rows(run)]
+
+
+def front_rows(run: Path) -> list[FrontRow]:
     """Return the front of a run, sorted by number of images, then precision.
 
     Raises:
@@ -67,7 +83,7 @@ def front(run: Path) -> list[FrontRow]:
     """
     design = read_design(run)
     networks = design["networks"]
-    best = networks[knee(objectives_of(design))]["id"]
+    best = networks[decide.knee(objectives_of(design))]["id"]
     unit = design["objectives"][1]["unit"]
     rows = [
         FrontRow(
@@ -89,7 +105,8 @@ def front(run: Path) -> list[FrontRow]:
 
 def choose(
     run: Path,
-    knee_point: bool = False,
+    *,
+    knee: bool = False,
     max_sigma_um: float | None = None,
     max_images: int | None = None,
     max_tour: float | None = None,
@@ -97,8 +114,8 @@ def choose(
     """Pick one network of a run's front.
 
     With limits: the cheapest network (fewest images, then shortest tour) that meets them; with limits and
-    ``knee_point``: the knee among those that meet them. Limits not given here come from the study's [requirements];
-    without any, the knee.
+    ``knee``: the knee among those that meet them. Without any limit and without ``knee`` the study's [requirements]
+    count; when there are none either, the knee.
 
     Raises:
         InputError: RUN/design.json is missing, a limit is not positive, or a distance names an unknown object point.
@@ -109,16 +126,17 @@ def choose(
             raise InputError(f"{name}: expected a positive number, found {limit:g}")
     design = read_design(run)
     objectives, networks = objectives_of(design), design["networks"]
-    # Only a flag alone can be answered without the study file; its distances need the scene.
-    task = load_task(run / "study.toml") if (run / "study.toml").is_file() else None
-    study = None if task is None else task.study
-    requirements = _requirements(design, study, max_sigma_um, max_images, max_tour)
-    if task is not None:
-        requirements += [_distance(design, task, asked) for asked in task.study.requirements.distances]
-    met = admissible(requirements, len(networks))
-    by_knee = knee_point or not requirements
-    index = knee(objectives, met) if by_knee else cheapest(objectives, met)
-    rows = front(run)
+    task = load_task(run / "study.toml")
+    own = task.study.requirements
+    asked_here = knee or any(limit is not None for limit in (max_sigma_um, max_images, max_tour))
+    if asked_here:
+        requirements = _limits(design, max_sigma_um, max_images, max_tour)
+    else:
+        requirements = _limits(design, own.max_sigma_um, own.max_images, own.max_tour) + _distances(design, task)
+    met = decide.admissible(requirements, len(networks))
+    by_knee = knee or not requirements
+    index = decide.knee(objectives, met) if by_knee else decide.cheapest(objectives, met)
+    rows = front_rows(run)
     row = next(row for row in rows if row.network == networks[index]["id"])
     asked = tuple(
         {"name": item.name, "limit": item.limit, "value": float(item.values[index]), "unit": item.unit}
@@ -160,44 +178,48 @@ def objectives_of(design: dict[str, Any]) -> Floats:
     return np.array(rows, dtype=np.float64)
 
 
-def _requirements(
-    design: dict[str, Any],
-    study: Study | None,
-    max_sigma_um: float | None,
-    max_images: int | None,
-    max_tour: float | None,
+def poses_of(network: dict[str, Any]) -> Floats:
+    """Return world_from_cam (n, 4, 4) in m of a network of design.json."""
+    poses = np.array(network["world_from_cam_mm"], dtype=np.float64)
+    poses[:, :3, 3] *= MM
+    return poses
+
+
+def _limits(
+    design: dict[str, Any], max_sigma_um: float | None, max_images: int | None, max_tour: float | None
 ) -> list[Requirement]:
-    """Return the limits on what stands in design.json; a flag goes before the study's own."""
-    networks, objectives = design["networks"], objectives_of(design)
-    own = None if study is None else study.requirements
-    sigma = np.array([np.inf if item["max_sigma_um"] is None else item["max_sigma_um"] for item in networks])
+    """Return the limits on what stands in design.json."""
+    objectives = objectives_of(design)
+    sigma = [np.inf if item["max_sigma_um"] is None else item["max_sigma_um"] for item in design["networks"]]
     candidates = (
-        ("largest point sigma", "µm", max_sigma_um, own and own.max_sigma_um, sigma),
-        ("number of images", "", max_images, own and own.max_images, objectives[:, 2]),
-        ("tour", design["objectives"][1]["unit"], max_tour, own and own.max_tour, objectives[:, 1]),
+        (SIGMA, "µm", max_sigma_um, np.array(sigma)),
+        ("number of images", "", max_images, objectives[:, 2]),
+        ("tour", design["objectives"][1]["unit"], max_tour, objectives[:, 1]),
     )
     return [
         Requirement(name=name, unit=unit, limit=float(limit), values=values)
-        for name, unit, flag, default, values in candidates
-        if (limit := default if flag is None else flag) is not None
+        for name, unit, limit, values in candidates
+        if limit is not None
     ]
 
 
-def _distance(design: dict[str, Any], task: Task, asked: DistanceRequirement) -> Requirement:
-    """Return the requirement on one distance, its U95 (k = 2) from the total covariance of every network."""
+def _distances(design: dict[str, Any], task: Task) -> list[Requirement]:
+    """Return the requirements on distances, their U95 (k = 2) from the total covariance of every network."""
+    asked = task.study.requirements.distances
     ids = task.scene.targets.point_ids
-    for name in (asked.from_, asked.to):
+    for name in [end for item in asked for end in (item.from_, item.to)]:
         if name not in ids:
             raise InputError(f"study.toml: requirements.distances: expected tag.corner of the part, found {name!r}")
-    ends = (ids.index(asked.from_), ids.index(asked.to))
-    values = [
-        distance_u95(task, np.array(item["world_from_cam_mm"]) * _MM_ROWS, ends) * 1e6 for item in design["networks"]
+    if not asked:
+        return []
+    ends = np.array([[ids.index(item.from_), ids.index(item.to)] for item in asked])
+    values = np.array([distance_u95(task, poses_of(network), ends) for network in design["networks"]]) * 1e6
+    return [
+        Requirement(
+            name=f"U95 of the distance {item.from_} to {item.to}", unit="µm", limit=item.u95_um, values=values[:, index]
+        )
+        for index, item in enumerate(asked)
     ]
-    name = f"U95 of the distance {asked.from_} to {asked.to}"
-    return Requirement(name=name, unit="µm", limit=asked.u95_um, values=np.array(values))
-
-
-_MM_ROWS = np.array([[1, 1, 1, MM]] * 3 + [[1, 1, 1, 1]])  # translation of a 4x4 from mm to m
 
 
 def _words(row: FrontRow) -> str:
@@ -214,11 +236,11 @@ def _trade(row: FrontRow, rows: list[FrontRow]) -> str:
     fewer = [other for other in rows if other.images < row.images]
     if fewer:
         other = max(fewer, key=lambda item: (item.images, -item.rms_sigma_um))
-        parts.append(f"{_images(row.images - other.images)} fewer make sigma {_factor(other, row)} as large")
+        parts.append(f"with {_images(row.images - other.images)} fewer, sigma is {_factor(other, row)} as large")
     more = [other for other in rows if other.images > row.images]
     if more:
         other = min(more, key=lambda item: (item.images, item.rms_sigma_um))
-        parts.append(f"{_images(other.images - row.images)} more bring it to {_factor(other, row)} of that")
+        parts.append(f"with {_images(other.images - row.images)} more, {_factor(other, row)}")
     return "; ".join(parts) if parts else "no other size to compare with"
 
 
@@ -235,9 +257,10 @@ def _warnings(network: dict[str, Any], row: FrontRow, asked: tuple[dict[str, Any
     found = [str(item) for item in network.get("warnings", ())]
     total = network.get("total_max_sigma_um")
     for item in asked:
-        if item["name"] == "largest point sigma" and total is not None and total > item["limit"]:
+        if item["name"] == SIGMA and total is not None and total > item["limit"]:
             found.append(
-                f"with total error propagation the largest point sigma is {total:.4g} µm, above the {item['limit']:g} µm"
+                f"with total error propagation the largest point sigma is {total:.4g} µm, "
+                f"above the {item['limit']:g} µm"
             )
     if row.verdict not in ("not validated", "pass"):
         found.append(f"the validation of this network says: {row.verdict}")

@@ -1,0 +1,141 @@
+"""Measuring one picture: find the tags, fit each, judge each. Nothing is dropped without a reason."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from netdesign.imaging.detect import detect, pose_from_tag
+from netdesign.imaging.fit import Fit, fit_tag
+from netdesign.imaging.tags import CELLS, cells
+from netdesign.model.arrays import Floats
+from netdesign.model.camera import Camera
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gates:
+    """When a fitted tag is believed.
+
+    Attributes:
+        max_incidence: rad; beyond it the rendered textures, and real print, are no longer well known.
+        min_cell_px: shortest edge of the tag divided by 8.
+        chi2_base, chi2_sigmas: largest chi²/dof is base + sigmas·sqrt(2/dof).
+        max_seed_shift_cells: largest distance of a corner from its seed, in cells, at least ``min_seed_shift_px``.
+        min_contrast: smallest (white - black) / full scale.
+        border_px: a tag with a corner nearer to the frame's edge is not measured.
+    """
+
+    max_incidence: float = float(np.radians(70.0))
+    min_cell_px: float = 1.5
+    chi2_base: float = 1.15
+    chi2_sigmas: float = 5.0
+    max_seed_shift_cells: float = 0.5
+    min_seed_shift_px: float = 3.0
+    min_contrast: float = 0.08
+    border_px: float = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TagMeasurement:
+    """One tag in one picture.
+
+    Attributes:
+        corners_px: (4, 2), order TL, TR, BR, BL, origin at the centre of the top-left pixel.
+        covariance_px2: (8, 8), order x0 y0 x1 y1 …
+        rejected: why the tag must not be used, "" when it may.
+        incidence: rad, from the tag's own pose.  The rest as in ``fit.Fit``.
+    """
+
+    tag_id: int
+    corners_px: Floats
+    covariance_px2: Floats
+    rejected: str
+    chi2_per_dof: float
+    pixels: int
+    sigma_px: float
+    black: float
+    white: float
+    cell_px: float
+    incidence: float
+    seed_shift_px: float
+
+
+def measure(
+    picture: NDArray[np.generic], camera: Camera, family: str, size_m: float, ids: Collection[int] | None = None,
+    gates: Gates | None = None, floor_px: float = 0.0,
+) -> list[TagMeasurement]:  # fmt: skip
+    """Measure every tag of a picture that is linear in light.
+
+    Args:
+        picture: (h, w) uint8 or uint16.  camera: gives interior orientation and the sensor's noise.
+        family, size_m: of the tags.  ids: the ids that may occur; None for all.
+        floor_px: systematic error of the method, added to every coordinate's variance.
+
+    Returns:
+        One measurement per recognised tag, by id; look at ``rejected`` before use. A tag id that shows more than
+        once is rejected wherever it shows.
+    """
+    judge = gates or Gates()
+    full_scale = 65535.0 if picture.dtype == np.uint16 else 255.0
+    gain = full_scale / camera.full_well_e
+    floor = (gain * camera.read_noise_e) ** 2 + 1 / 12
+    measured = []
+    for seed in detect(picture, family, ids):
+        fit = fit_tag(picture, cells(family, seed.tag_id), seed.corners_px, camera.intrinsics, gain, floor)
+        edges = np.linalg.norm(np.roll(fit.corners_px, -1, axis=0) - fit.corners_px, axis=1)
+        shift = float(np.linalg.norm(fit.corners_px - seed.corners_px, axis=1).max())
+        incidence = _incidence(fit, size_m, camera.intrinsics) if fit.converged else float("nan")
+        measured.append(
+            TagMeasurement(
+                tag_id=seed.tag_id,
+                corners_px=fit.corners_px,
+                covariance_px2=fit.covariance_px2 + floor_px**2 * np.eye(8),
+                rejected=_reason(fit, judge, picture.shape, full_scale, float(edges.min()) / CELLS, shift, incidence),
+                chi2_per_dof=fit.chi2_per_dof,
+                pixels=fit.pixels,
+                sigma_px=fit.sigma_px,
+                black=fit.black,
+                white=fit.white,
+                cell_px=float(edges.min()) / CELLS,
+                incidence=incidence,
+                seed_shift_px=shift,
+            )
+        )
+    ids_seen = [item.tag_id for item in measured]
+    return [
+        replace(item, rejected=item.rejected or f"tag {item.tag_id} shows {ids_seen.count(item.tag_id)} times")
+        if ids_seen.count(item.tag_id) > 1
+        else item
+        for item in measured
+    ]
+
+
+def _incidence(fit: Fit, size_m: float, intrinsics: Floats) -> float:
+    """Return the angle (rad) between the tag's normal and the direction to the camera."""
+    position = pose_from_tag(fit.corners_px, size_m, intrinsics)[0][0][:3, 3]
+    return float(np.arccos(np.clip(position[2] / np.linalg.norm(position), -1.0, 1.0)))
+
+
+def _reason(
+    fit: Fit, gates: Gates, shape: tuple[int, ...], full_scale: float, cell_px: float, shift: float, incidence: float
+) -> str:
+    """Return why a fit is not believed, or ""."""
+    if not fit.converged:
+        return f"fit not converged after {fit.iterations} iterations"
+    low, high = fit.corners_px.min(axis=0), fit.corners_px.max(axis=0)
+    if (low < gates.border_px).any() or (high > np.array(shape[::-1]) - 1 - gates.border_px).any():
+        return "cut by the frame"
+    if cell_px < gates.min_cell_px:
+        return f"cell {cell_px:.2f} px, at least {gates.min_cell_px:.2f} px needed"
+    if not incidence <= gates.max_incidence:
+        return f"incidence {np.degrees(incidence):.1f} deg, at most {np.degrees(gates.max_incidence):.1f} deg allowed"
+    if fit.white - fit.black < gates.min_contrast * full_scale:
+        return f"contrast {(fit.white - fit.black) / full_scale:.3f}, at least {gates.min_contrast:.3f} needed"
+    shift_limit = max(gates.max_seed_shift_cells * cell_px, gates.min_seed_shift_px)
+    if shift > shift_limit:
+        return f"corner {shift:.2f} px from its seed, at most {shift_limit:.2f} px allowed"
+    limit = gates.chi2_base + gates.chi2_sigmas * float(np.sqrt(2.0 / max(fit.pixels, 1)))
+    if fit.chi2_per_dof > limit:
+        return f"chi2/dof {fit.chi2_per_dof:.2f}, at most {limit:.2f} allowed"
+    return ""

@@ -1,0 +1,163 @@
+"""The image of a tag as the fit models it: exact cell coverage on a sub-pixel grid, blurred by a Gaussian.
+
+A sub-pixel is a square of side h that the homography maps, to first order, to a parallelogram in tag coordinates.
+Its coverage by a straight cell edge is the integral of a trapezoid (a box of width |du/dx| h convolved with one of
+width |du/dy| h); coverages along u and along v are multiplied, exact for straight edges. Boxes of 1/h sub-pixels make
+the pixel again, so that the pixel integration is exact and only the Gaussian is sampled.
+
+Kernels: arrays in, arrays out. Three layers are followed through the blur: white cells, the surround beyond the quiet
+zone, and their sum weighted with the current grey levels, of which the derivatives are needed.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from netdesign.model.arrays import Floats
+
+FAST = {"contract", "reassoc", "arcp", "nsz"}
+
+
+def kernel_reach(sigma: float, per_pixel: int) -> int:
+    """Return the sub-pixels beyond a pixel that ``kernels`` of a Gaussian up to ``sigma`` needs."""
+    return int(np.ceil(4.0 * sigma * per_pixel))
+
+
+def kernels(sigma: float, per_pixel: int, reach: int) -> Floats:
+    """Return (3, 2 reach + per_pixel) taps: blur with pixel integration, its slope, its derivative by sigma.
+
+    Applied to an image, the slope taps give the spatial derivative (per px) of the blurred image.
+
+    Args:
+        sigma: of the Gaussian, px.  per_pixel: sub-pixels along a pixel.  reach: from ``kernel_reach``.
+    """
+    x = np.arange(-reach, reach + 1) / per_pixel
+    bell = np.exp(-0.5 * (x / sigma) ** 2)
+    weight = bell / bell.sum()
+    mean_square = float((weight * x * x).sum())
+    rows = np.stack([weight, weight * x / sigma**2, weight * (x * x - mean_square) / sigma**3])
+    box = np.full(per_pixel, 1.0 / per_pixel)
+    return np.stack([np.convolve(row, box) for row in rows])
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _trapezoid(t: float, wide: float, narrow: float) -> float:
+    """Integral to t of the unit trapezoid that is flat to ±(wide - narrow)/2 and ends at ±(wide + narrow)/2."""
+    outer = 0.5 * (wide + narrow)
+    if t >= outer:
+        return 1.0
+    if t <= -outer:
+        return 0.0
+    inner = 0.5 * (wide - narrow)
+    size = abs(t)
+    if size <= inner:
+        return 0.5 + t / wide
+    rest = outer - size
+    tail = 0.5 * rest * rest / (wide * narrow)
+    return 1.0 - tail if t > 0 else tail
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _span(t: float, wide: float, narrow: float, shares: Floats) -> int:
+    """Fill ``shares`` with the shares of a sub-pixel centred at t in consecutive cells; return the first cell."""
+    outer = 0.5 * (wide + narrow)
+    first = int(np.floor(t - outer))
+    before = 0.0
+    for index in range(len(shares)):
+        upto = _trapezoid(first + index + 1.0 - t, wide, narrow)
+        shares[index] = upto - before
+        before = upto
+    return first
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def cover(
+    grid_x: Floats, grid_y: Floats, tag_from_px: Floats, cells: NDArray[np.uint8], h: float, layers: Floats
+) -> None:
+    """Fill ``layers`` (2, r, c) with white and surround coverage of every sub-pixel.
+
+    Args:
+        grid_x, grid_y: (r, c) undistorted pixel coordinates of the sub-pixel centres.
+        tag_from_px: (3, 3) homography to cell coordinates.
+        cells: (8, 8) of the tag, 1 white.  h: side of a sub-pixel, ideal px.
+    """
+    rows, columns = grid_x.shape
+    m = tag_from_px
+    share_u, share_v = np.empty(6), np.empty(6)
+    for r in range(rows):
+        for c in range(columns):
+            x, y = grid_x[r, c], grid_y[r, c]
+            w = 1.0 / (m[2, 0] * x + m[2, 1] * y + m[2, 2])
+            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) * w
+            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) * w
+            ux, uy = abs(m[0, 0] - u * m[2, 0]) * abs(w) * h, abs(m[0, 1] - u * m[2, 1]) * abs(w) * h
+            vx, vy = abs(m[1, 0] - v * m[2, 0]) * abs(w) * h, abs(m[1, 1] - v * m[2, 1]) * abs(w) * h
+            wide_u, narrow_u = max(ux, uy, 1e-9), max(min(ux, uy), 1e-9)
+            wide_v, narrow_v = max(vx, vy, 1e-9), max(min(vx, vy), 1e-9)
+            half_u, half_v = 0.5 * (wide_u + narrow_u), 0.5 * (wide_v + narrow_v)
+            column, row = int(np.floor(u)), int(np.floor(v))
+            if u - column > half_u and column + 1 - u > half_u and v - row > half_v and row + 1 - v > half_v:
+                beyond = row < -1 or row > 8 or column < -1 or column > 8
+                quiet = row == -1 or row == 8 or column == -1 or column == 8
+                layers[1, r, c] = 1.0 if beyond else 0.0
+                layers[0, r, c] = 0.0 if beyond else (1.0 if quiet else float(cells[row, column]))
+                continue
+            first_u = _span(u, wide_u, narrow_u, share_u)
+            first_v = _span(v, wide_v, narrow_v, share_v)
+            count_u = int(np.floor(u + half_u)) - first_u + 1
+            count_v = int(np.floor(v + half_v)) - first_v + 1
+            white, outside = 0.0, 0.0
+            for j in range(min(count_v, 6)):
+                row = first_v + j
+                for i in range(min(count_u, 6)):
+                    column = first_u + i
+                    share = share_u[i] * share_v[j]
+                    if row < -1 or row > 8 or column < -1 or column > 8:
+                        outside += share
+                    elif row == -1 or row == 8 or column == -1 or column == 8 or cells[row, column] == 1:
+                        white += share
+            layers[0, r, c] = white
+            layers[1, r, c] = outside
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def blur(
+    layers: Floats, taps: Floats, per_pixel: int, black: float, white: float, surround: float, out: Floats
+) -> None:
+    """Blur the layers and form the derivatives of the grey-level image.
+
+    Args:
+        layers: (2, r·s + taps - s, c·s + taps - s) from ``cover``.  taps: (3, taps) from ``kernels``.
+        out: (5, r, c) filled with: white share, surround share, and of the image black + (white - black)·white share
+            + (surround - black)·surround share the derivatives along x, along y, and by sigma.
+    """
+    rows, columns = out.shape[1], out.shape[2]
+    count, fine_columns = taps.shape[1], layers.shape[2]
+    line = np.empty((4, fine_columns))
+    up, beyond = white - black, surround - black
+    for r in range(rows):
+        line[:] = 0.0
+        for t in range(count):
+            k0, k1, k2 = taps[0, t], taps[1, t], taps[2, t]
+            source = r * per_pixel + t
+            for c in range(fine_columns):
+                a, b = layers[0, source, c], layers[1, source, c]
+                mixed = up * a + beyond * b
+                line[0, c] += k0 * a
+                line[1, c] += k0 * b
+                line[2, c] += k1 * mixed
+                line[3, c] += k2 * mixed
+        for c in range(columns):
+            p = s = dx = dy = ds = 0.0
+            for t in range(count):
+                k0, k1, k2 = taps[0, t], taps[1, t], taps[2, t]
+                at = c * per_pixel + t
+                a, b = line[0, at], line[1, at]
+                mixed = up * a + beyond * b
+                p += k0 * a
+                s += k0 * b
+                dx += k1 * mixed
+                dy += k0 * line[2, at]
+                ds += k2 * mixed + k0 * line[3, at]
+            out[0, r, c], out[1, r, c] = p, s
+            out[2, r, c], out[3, r, c], out[4, r, c] = dx, dy, ds

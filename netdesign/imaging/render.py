@@ -1,0 +1,294 @@
+"""Pictures of a scene through pyrender on EGL: the only file that meets pyrender and OpenGL.
+
+What is done here and why (measured in the project's imaging notes): flat shading, because anything else applies a
+gamma curve and shifts every edge once pixels are averaged; supersampling without multisampling, because texture
+filtering is what smooths a tag and multisampling only costs; vertices in the camera frame with the camera at the
+identity; textures of about 1.5 supersamples per texel with trilinear mip maps; horizontal bands, so that memory stays
+bounded at any resolution. One OpenGL context per process, used from the thread that made it, never across a fork:
+start worker processes with "spawn".
+
+Pixel origin: pyrender measures from the corner of the picture, hence +0.5 on the principal point. Camera axes:
+OpenGL's y points up and z backwards, hence the sign change of both in ``_gl``.
+"""
+
+import os
+import warnings
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from netdesign.errors import EnvironmentProblem
+from netdesign.imaging.geometry import FACE_STEP_PX, TagQuad, divided, part_triangles, tag_quads
+from netdesign.imaging.optics import Picture, decimate, margin_px
+from netdesign.imaging.tags import CELLS, QUIET_CELLS, texture
+from netdesign.model.arrays import Floats, Ints
+from netdesign.model.camera import Camera
+from netdesign.model.scene import Scene
+
+PACKAGES = "libegl1 libgl1"  # Debian and Ubuntu; they pull Mesa's software rasteriser
+MAX_SIDE = 16384  # of a render target
+BAND_SAMPLES = 2**25  # supersamples of one band: 270 MB of colour and depth
+SUPERSAMPLES_PER_TEXEL = 1.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Appearance:
+    """Linear light levels of the picture, full scale 1.
+
+    Attributes:
+        black, white: of a tag and its quiet zone.
+        face: of a part's face that looks at the light, darker by up to ``relief`` when it looks away: only for the eye.
+        light: (3,) direction to that light, world frame.
+    """
+
+    black: float = 20 / 255
+    white: float = 235 / 255
+    face: float = 0.72
+    relief: float = 0.22
+    background: float = 0.25
+    light: tuple[float, float, float] = (0.45, 0.25, 0.86)
+
+
+def probe() -> str:
+    """Return what OpenGL calls its renderer.
+
+    Raises:
+        EnvironmentProblem: EGL or OpenGL is missing; the message names the Debian packages.
+    """
+    gl = _offscreen(64, 64).gl
+    return f"{gl.glGetString(gl.GL_RENDERER).decode()}, OpenGL {gl.glGetString(gl.GL_VERSION).decode()}"
+
+
+class Renderer:
+    """Draws one scene with one camera."""
+
+    def __init__(self, scene: Scene, camera: Camera, supersample: int = 4, appearance: Appearance | None = None):
+        """Prepare the scene; the OpenGL context is made at the first picture."""
+        self.scene, self.camera, self.supersample = scene, camera, supersample
+        self.appearance = appearance or Appearance()
+        self._textures: dict[tuple[int, int], Any] = {}
+        self._divided: dict[float, tuple[Floats, Ints]] = {}
+        self._face_level = _face_levels(scene, self.appearance)
+
+    def render(self, world_from_cam: Floats) -> Picture:
+        """Return the (h, w) light on the sensor, full scale 1, blurred by the optics and integrated over pixels.
+
+        Args:
+            world_from_cam: (4, 4) m.
+
+        Raises:
+            EnvironmentProblem: EGL or OpenGL is missing.
+        """
+        camera, factor = self.camera, self.supersample
+        margin = margin_px(camera.blur_px)
+        rows = max(1, min(BAND_SAMPLES // (factor**2 * camera.width_px), MAX_SIDE // factor) - 2 * margin)
+        rows = min(rows, camera.height_px)
+        picture = np.empty((camera.height_px, camera.width_px), np.float32)
+        with _Drawing(self._primitives(world_from_cam), self.appearance.background) as drawing:
+            for first in range(0, camera.height_px, rows):
+                wanted = min(rows, camera.height_px - first)
+                fine = drawing.band(camera, factor, first - margin, rows + 2 * margin)
+                picture[first : first + wanted] = decimate(fine, camera.blur_px, factor, margin, wanted)
+        return picture
+
+    def _primitives(self, world_from_cam: Floats) -> list[Any]:
+        """Return the tags and the part as pyrender primitives in OpenGL's camera frame."""
+        primitive, material = _pyrender().Primitive, _pyrender().MetallicRoughnessMaterial
+        quads = tag_quads(self.scene.targets, self.camera, world_from_cam)
+        drawn = [
+            primitive(
+                positions=_gl(quad.vertices), texcoord_0=np.asarray(quad.uv, np.float32), indices=quad.faces,
+                material=material(baseColorTexture=self._texture(quad), baseColorFactor=[1.0, 1.0, 1.0, 1.0]),
+            )
+            for quad in quads
+        ]  # fmt: skip
+        triangles, face = self._part_faces(world_from_cam)
+        bent, usable = part_triangles(triangles, self.camera, world_from_cam, nearest=1e-3)
+        if usable.any():
+            level = np.repeat(self._face_level[face[usable]], 3)
+            color = np.stack([level, level, level, np.ones_like(level)], axis=1).astype(np.float32)
+            drawn.append(
+                primitive(
+                    positions=_gl(bent[usable].reshape(-1, 3)), color_0=color,
+                    material=material(baseColorFactor=[1.0, 1.0, 1.0, 1.0], doubleSided=True),
+                )
+            )  # fmt: skip
+        return drawn
+
+    def _part_faces(self, world_from_cam: Floats) -> tuple[Floats, Ints]:
+        """Return the part's triangles, divided as finely as this view needs under distortion."""
+        part = self.scene.part
+        if not self.camera.distortion.any():
+            return part.triangles, np.arange(len(part.faces))
+        distance = np.linalg.norm(part.vertices - world_from_cam[:3, 3], axis=1).min()
+        longest = FACE_STEP_PX * max(float(distance), 0.05) / float(self.camera.focal_px.max())
+        longest = float(2 ** np.floor(np.log2(longest)))  # few distinct values: divide once, use for many views
+        if longest not in self._divided:
+            self._divided[longest] = divided(part, longest)
+        return self._divided[longest]
+
+    def _texture(self, quad: TagQuad) -> Any:
+        texels = 4 * round(quad.cell_px * self.supersample / SUPERSAMPLES_PER_TEXEL / 4)
+        texels = min(max(texels, 8), 96)
+        key = (quad.tag, texels)
+        if key not in self._textures:
+            targets, look = self.scene.targets, self.appearance
+            image = texture(targets.family, int(targets.ids[quad.tag]), texels, look.black, look.white)
+            self._textures[key] = _pyrender().Texture(source=image, source_channels="R")
+        return self._textures[key]
+
+
+def _face_levels(scene: Scene, look: Appearance) -> Floats:
+    """Return the (t,) light levels of the part's faces."""
+    a, b, c = np.moveaxis(scene.part.triangles, 1, 0)
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    light = np.asarray(look.light) / np.linalg.norm(look.light)
+    return np.asarray(look.face - look.relief * 0.5 * (1 - normals @ light))
+
+
+def _gl(vertices: Floats) -> NDArray[np.float32]:
+    return (vertices * (1.0, -1.0, -1.0)).astype(np.float32)
+
+
+class _Drawing:
+    """A pyrender scene in OpenGL memory; leaves nothing behind."""
+
+    def __init__(self, primitives: list[Any], background: float):
+        pyrender = _pyrender()
+        depths = np.concatenate([-item.positions[:, 2] for item in primitives] or [np.ones(1)])
+        self._near, self._far = 0.9 * float(depths.min()), 1.1 * float(depths.max())
+        self._scene = pyrender.Scene(bg_color=[background, background, background, 1.0])
+        for item in primitives:
+            self._scene.add(pyrender.Mesh([item]))
+
+    def __enter__(self) -> "_Drawing":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        _offscreen(64, 64).clear(self._scene)
+
+    def band(self, camera: Camera, factor: int, first_row: int, rows: int) -> NDArray[np.uint8]:
+        """Return (rows·factor, width·factor) grey levels of a band that begins at pixel row ``first_row``."""
+        if camera.width_px * factor > MAX_SIDE:
+            raise EnvironmentProblem(
+                f"supersample: OpenGL draws at most {MAX_SIDE} samples across, found {camera.width_px} px x {factor}"
+            )
+        fx, fy = camera.focal_px * factor
+        cx, cy = (camera.principal_point_px + 0.5 - (0, first_row)) * factor
+        node = self._scene.add(
+            _pyrender().IntrinsicsCamera(fx, fy, cx, cy, znear=self._near, zfar=self._far), pose=np.eye(4)
+        )
+        fine = _offscreen(camera.width_px * factor, rows * factor).draw(self._scene)
+        self._scene.remove_node(node)
+        return fine
+
+
+@lru_cache(maxsize=1)
+def _pyrender() -> Any:
+    """Import pyrender for EGL on a machine without a display.
+
+    Raises:
+        EnvironmentProblem: a system library is missing.
+    """
+    os.environ["PYOPENGL_PLATFORM"] = "egl"
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # one worker process per core renders, not one thread
+    if not hasattr(np, "infty"):
+        np.infty = np.inf  # type: ignore[attr-defined]  # pyrender 0.1.45 predates numpy 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # deprecations inside third-party modules
+        import pyglet
+
+        pyglet.options["headless"] = True  # or its window module asks for an X display
+        try:
+            import pyrender
+            import pyrender.platforms.egl  # noqa: F401
+        except (ImportError, AttributeError, OSError) as error:
+            raise _missing(error) from None
+    return pyrender
+
+
+def _missing(error: Exception) -> EnvironmentProblem:
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return EnvironmentProblem(
+        f"rendering needs EGL and OpenGL: apt-get install --no-install-recommends {PACKAGES} "
+        f"(or use the reference renderer); found: {reason}"
+    )
+
+
+@lru_cache(maxsize=1)
+def _context() -> Any:
+    """Make this process's one OpenGL context and our slim pyrender back end in it."""
+    pyrender = _pyrender()
+    import OpenGL.error
+    from OpenGL import GL as gl
+    from pyrender.renderer import Renderer as Stock
+
+    class Slim(Stock):  # type: ignore[misc]
+        """pyrender's renderer with a plain framebuffer: no multisampling, red channel only."""
+
+        gl: Any = None
+
+        def _configure_main_framebuffer(self) -> None:
+            size = (self.viewport_width, self.viewport_height)
+            if self._main_fb is not None and size == self._main_fb_dims:
+                return
+            self._delete_main_framebuffer()
+            self._main_cb, self._main_db = gl.glGenRenderbuffers(2)
+            self._main_fb = self._main_fb_ms = gl.glGenFramebuffers(1)
+            gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, self._main_fb)
+            for buffer, kind, place in (
+                (self._main_cb, gl.GL_RGBA, gl.GL_COLOR_ATTACHMENT0),
+                (self._main_db, gl.GL_DEPTH_COMPONENT24, gl.GL_DEPTH_ATTACHMENT),
+            ):
+                gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, buffer)
+                gl.glRenderbufferStorage(gl.GL_RENDERBUFFER, kind, *size)
+                gl.glFramebufferRenderbuffer(gl.GL_DRAW_FRAMEBUFFER, place, gl.GL_RENDERBUFFER, buffer)
+            self._main_fb_dims = size
+
+        def _delete_main_framebuffer(self) -> None:
+            if self._main_fb is not None:
+                gl.glDeleteFramebuffers(1, [self._main_fb])
+                gl.glDeleteRenderbuffers(2, [self._main_cb, self._main_db])
+            self._main_fb = self._main_fb_ms = self._main_cb = self._main_db = None
+            self._main_fb_dims = (None, None)
+
+        def _read_main_framebuffer(self, scene: Any, flags: int) -> NDArray[np.uint8]:
+            width, height = self._main_fb_dims
+            gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._main_fb)
+            gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
+            data = gl.glReadPixels(0, 0, width, height, gl.GL_RED, gl.GL_UNSIGNED_BYTE)
+            return np.frombuffer(data, np.uint8).reshape(height, width)[::-1]
+
+        def draw(self, scene: Any) -> NDArray[np.uint8]:
+            flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.OFFSCREEN
+            grey: NDArray[np.uint8] = self.render(scene, flags)
+            return grey
+
+        def clear(self, scene: Any) -> None:
+            """Take the scene's meshes out of OpenGL memory; textures go with them."""
+            empty = pyrender.Scene()
+            empty.add(pyrender.IntrinsicsCamera(1, 1, 1, 1))
+            self._update_context(empty, pyrender.RenderFlags.FLAT)
+
+    try:
+        from pyrender.platforms.egl import EGLPlatform, get_device_by_index
+
+        platform = EGLPlatform(64, 64, device=get_device_by_index(int(os.environ.get("EGL_DEVICE_ID", "0"))))
+        platform.init_context()
+        platform.make_current()
+        slim = Slim(64, 64)
+    except (ImportError, AttributeError, ValueError, OpenGL.error.Error) as error:
+        raise _missing(error) from None
+    slim.gl, slim.platform = gl, platform
+    return slim
+
+
+def _offscreen(width: int, height: int) -> Any:
+    """Return the back end with its viewport set."""
+    slim = _context()
+    slim.viewport_width, slim.viewport_height = width, height
+    return slim

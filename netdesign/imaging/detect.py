@@ -40,7 +40,7 @@ def detect(picture: NDArray[np.generic], family: str, ids: Collection[int] | Non
     Raises:
         InputError: the family is not known.
     """
-    grey = np.ascontiguousarray(picture if picture.dtype == np.uint8 else picture >> 8, np.uint8)
+    grey = np.ascontiguousarray(picture if picture.dtype == np.uint8 else np.asarray(picture, np.uint16) >> 8, np.uint8)
     corners, found, _ = _detector(family, max(grey.shape)).detectMarkers(grey)
     if found is None:
         return []

@@ -59,16 +59,17 @@ def homography(corners: Floats) -> tuple[Floats, Floats]:
     for index, ((u, v), (x, y)) in enumerate(zip(SQUARE, corners, strict=True)):
         design[2 * index] = (u, v, 1, 0, 0, 0, -u * x, -v * x)
         design[2 * index + 1] = (0, 0, 0, u, v, 1, -u * y, -v * y)
-    inverse = np.linalg.inv(design)
-    h = inverse @ right
+    inverse: Floats = np.linalg.inv(design)
+    h: Floats = inverse @ right
     scale = SQUARE @ h[6:] + 1.0
-    return np.append(h, 1.0).reshape(3, 3), inverse * np.repeat(scale, 2)
+    return np.append(h, 1.0).reshape(3, 3), np.asarray(inverse * np.repeat(scale, 2))
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def _normal_equations(
     picture: Floats, centres: Floats, model: Floats, px_from_tag: Floats, tag_from_px: Floats, px_from_ideal: Floats,
-    levels: Floats, frame: Floats, noise: Floats, inside: NDArray[np.bool_], choose: bool, normal: Floats, right: Floats,
+    levels: Floats, frame: Floats, noise: Floats, inside: NDArray[np.bool_], choose: bool, normal: Floats,
+    right: Floats,
 ) -> tuple[float, int]:  # fmt: skip
     """Sum the normal equations over the pixels of the tag and its inner rim.
 

@@ -138,15 +138,13 @@ def divided(part: Part, longest: float) -> tuple[Floats, Ints]:
     return np.concatenate(done), np.concatenate(done_face)
 
 
-def part_triangles(
-    triangles: Floats, camera: Camera, world_from_cam: Floats, nearest: float
-) -> tuple[Floats, Bools]:
+def part_triangles(triangles: Floats, camera: Camera, world_from_cam: Floats, nearest: float) -> tuple[Floats, Bools]:
     """Return (k, 3, 3) triangles (m, world) in the camera frame, recessed and distorted, and the (k,) usable ones.
 
     A triangle with a vertex nearer than ``nearest`` along the optical axis is not usable.
     """
     in_camera = transform(inverse(world_from_cam), triangles)
-    usable = (in_camera[..., 2] > nearest).all(axis=1)
+    usable: Bools = np.all(in_camera[..., 2] > nearest, axis=1)
     bent = np.zeros_like(in_camera)
     bent[usable] = distorted_vertices(in_camera[usable], camera.distortion) * (1 + RECESS)
     return bent, usable

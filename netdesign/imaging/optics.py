@@ -118,10 +118,11 @@ def expose(light: Picture, camera: Camera, generator: np.random.Generator | None
         (h, w) uint8 or uint16.
     """
     full_scale = 2**bits - 1
-    level = light
+    level: Picture = light
     if generator is not None:
         well = camera.full_well_e
         variance = np.maximum(light, 0.0) / np.float32(well) + np.float32((camera.read_noise_e / well) ** 2)
-        level = light + np.sqrt(variance) * generator.standard_normal(light.shape, dtype=np.float32)
+        level = (light + np.sqrt(variance) * generator.standard_normal(light.shape, np.float32)).astype(np.float32)
     rounded = np.clip(np.rint(level * np.float32(full_scale)), 0, full_scale)
-    return rounded.astype(np.uint8 if bits == 8 else np.uint16)
+    grey: NDArray[np.generic] = rounded.astype(np.uint8 if bits == 8 else np.uint16)
+    return grey

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from netdesign.errors import EnvironmentProblem
 from netdesign.imaging.geometry import FACE_STEP_PX, TagQuad, divided, part_triangles, tag_quads
 from netdesign.imaging.optics import Picture, decimate, margin_px
-from netdesign.imaging.tags import CELLS, QUIET_CELLS, texture
+from netdesign.imaging.tags import texture
 from netdesign.model.arrays import Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.scene import Scene
@@ -182,7 +182,7 @@ class _Drawing:
         node = self._scene.add(
             _pyrender().IntrinsicsCamera(fx, fy, cx, cy, znear=self._near, zfar=self._far), pose=np.eye(4)
         )
-        fine = _offscreen(camera.width_px * factor, rows * factor).draw(self._scene)
+        fine: NDArray[np.uint8] = _offscreen(camera.width_px * factor, rows * factor).draw(self._scene)
         self._scene.remove_node(node)
         return fine
 
@@ -197,7 +197,7 @@ def _pyrender() -> Any:
     os.environ["PYOPENGL_PLATFORM"] = "egl"
     os.environ.setdefault("LP_NUM_THREADS", "1")  # one worker process per core renders, not one thread
     if not hasattr(np, "infty"):
-        np.infty = np.inf  # type: ignore[attr-defined]  # pyrender 0.1.45 predates numpy 2
+        setattr(np, "infty", np.inf)  # noqa: B010  # pyrender 0.1.45 predates numpy 2
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # deprecations inside third-party modules
         import pyglet
@@ -205,7 +205,7 @@ def _pyrender() -> Any:
         pyglet.options["headless"] = True  # or its window module asks for an X display
         try:
             import pyrender
-            import pyrender.platforms.egl  # noqa: F401
+            import pyrender.platforms.egl
         except (ImportError, AttributeError, OSError) as error:
             raise _missing(error) from None
     return pyrender
@@ -231,6 +231,8 @@ def _context() -> Any:
         """pyrender's renderer with a plain framebuffer: no multisampling, red channel only."""
 
         gl: Any = None
+        _main_fb: Any
+        _main_fb_dims: Any
 
         def _configure_main_framebuffer(self) -> None:
             size = (self.viewport_width, self.viewport_height)

@@ -1,0 +1,233 @@
+"""Synthetic image sets with their truth, and the measurement of image sets.
+
+    with worker_pool(2) as executor:
+        paths = render_images(scene, camera, limits, world_from_cam, folder, Shoot(seed=1), executor=executor)
+        measured = measure_images(paths, camera, scene.targets, executor=executor)
+
+Pictures do not depend on the number of workers or on their order. A folder is finished where it was left: its
+truth.json says what it is, and every picture appears whole or not at all.
+"""
+
+import contextlib
+import multiprocessing
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from netdesign.files.colmap import ColmapModel, point3d_id, write_model
+from netdesign.files.noise import read_corner_noise
+from netdesign.files.store import write_bytes, write_json, write_text
+from netdesign.imaging.measure import Gates, TagMeasurement, measure
+from netdesign.imaging.photograph import Photographer, Shoot
+from netdesign.imaging.pictures import png_bytes, read_picture
+from netdesign.model.arrays import Bools, Floats
+from netdesign.model.camera import Camera
+from netdesign.model.network import Observations
+from netdesign.model.progress import Progress, silent
+from netdesign.model.scene import CORNERS_PER_TAG, Scene, Targets
+from netdesign.model.task import VisibilityLimits
+from netdesign.photogrammetry.collinearity import project
+from netdesign.photogrammetry.visibility import sightings
+
+MM = 1e-3
+
+
+@contextlib.contextmanager
+def worker_pool(workers: int) -> Iterator[Executor | None]:
+    """Give an executor of spawned processes, or None (work in this process) for fewer than two workers.
+
+    A process that holds an OpenGL context must not be forked, hence "spawn". A worker needs up to 1 GB.
+    """
+    if workers < 2:
+        yield None
+        return
+    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def image_name(index: int) -> str:
+    """Return the file name of picture ``index``."""
+    return f"{index:04d}.png"
+
+
+def render_images(
+    scene: Scene, camera: Camera, limits: VisibilityLimits, world_from_cam: Floats, out: Path, shoot: Shoot, *,
+    executor: Executor | None = None, progress: Progress = silent, study_sha256: str | None = None,
+) -> list[Path]:  # fmt: skip
+    """Render an image set: images/*.png, truth.json, corners.csv and a COLMAP text model.
+
+    The truth lists the corners of tags that are seen by the definition of ``limits``.
+
+    Args:
+        world_from_cam: (n, 4, 4) m, the exact poses.
+
+    Returns:
+        The n image paths.
+
+    Raises:
+        EnvironmentProblem: the renderer's system libraries are missing.
+    """
+    visible = sightings(scene, camera, world_from_cam, limits).visible
+    xy_px, _ = project(world_from_cam[:, None], scene.targets.points[None], camera.intrinsics)
+    paths = [out / "images" / image_name(index) for index in range(len(world_from_cam))]
+    _write_truth(scene, camera, world_from_cam, visible, xy_px, out, shoot, study_sha256)
+    missing = [index for index, path in enumerate(paths) if not path.is_file()]
+    session = pickle.dumps((scene, camera, shoot))
+    jobs = [(session, index, world_from_cam[index], paths[index]) for index in missing]
+    for _ in _each(_render_one, jobs, executor, "render", progress):
+        pass
+    return paths
+
+
+def measure_images(
+    paths: Sequence[Path], camera: Camera, targets: Targets, *, gates: Gates | None = None,
+    floor_px: float | None = None, executor: Executor | None = None, progress: Progress = silent,
+) -> list[list[TagMeasurement]]:  # fmt: skip
+    """Detect and fit the tags of every picture; look at ``rejected`` before use.
+
+    Args:
+        floor_px: systematic error of the method added to every coordinate's variance; None takes the camera's
+            calibrated noise, else the shipped one.
+    """
+    if floor_px is None:
+        floor_px = (camera.corner_noise or read_corner_noise(None)).floor_px
+    jobs = [(path, camera, targets, gates, floor_px) for path in paths]
+    return list(_each(_measure_one, jobs, executor, "measure", progress))
+
+
+def observations_of(
+    measured: Sequence[Sequence[TagMeasurement]], targets: Targets
+) -> tuple[Observations, list[Floats], list[str]]:
+    """Return what may be used, as observations.
+
+    Args:
+        measured: per image, from ``measure_images``.
+
+    Returns:
+        Observations, tag by tag with four rows each; the (8, 8) px² covariance of each of those tags in that order;
+        and for every rejected tag "image i, tag t: reason".
+    """
+    row_of_tag = {tag: row for row, tag in enumerate(targets.ids.tolist())}
+    image: list[int] = []
+    point: list[int] = []
+    xy_px: list[Floats] = []
+    blocks: list[Floats] = []
+    covariances: list[Floats] = []
+    rejected = []
+    for index, tags in enumerate(measured):
+        for tag in tags:
+            reason = tag.rejected or ("" if tag.tag_id in row_of_tag else "not a tag of the part")
+            if reason:
+                rejected.append(f"image {index}, tag {tag.tag_id}: {reason}")
+                continue
+            first = CORNERS_PER_TAG * row_of_tag[tag.tag_id]
+            image += [index] * CORNERS_PER_TAG
+            point += range(first, first + CORNERS_PER_TAG)
+            xy_px += list(tag.corners_px)
+            blocks += [tag.covariance_px2[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(CORNERS_PER_TAG)]
+            covariances.append(tag.covariance_px2)
+    observations = Observations(
+        image=np.array(image, np.int64), point=np.array(point, np.int64), xy_px=np.reshape(xy_px, (-1, 2)),
+        covariance=np.reshape(blocks, (-1, 2, 2)),
+    )  # fmt: skip
+    return observations, covariances, rejected
+
+
+def _write_truth(
+    scene: Scene, camera: Camera, world_from_cam: Floats, visible: Bools, xy_px: Floats, out: Path, shoot: Shoot,
+    study_sha256: str | None,
+) -> None:  # fmt: skip
+    """Write what the pictures are; pictures of another truth are removed first."""
+    names = [image_name(index) for index in range(len(world_from_cam))]
+    ids = scene.targets.point_ids
+    poses = world_from_cam.copy()
+    poses[:, :3, 3] /= MM
+    truth = {
+        "camera": camera_record(camera),
+        "renderer": shoot.renderer,
+        "seed": shoot.seed,
+        "supersample": shoot.supersample,
+        "bits": shoot.bits,
+        "noise": shoot.noise,
+        "tags": {"family": scene.targets.family, "size_mm": scene.targets.size_m / MM},
+        "points": [{"id": name, "xyz_mm": xyz / MM} for name, xyz in zip(ids, scene.targets.points, strict=True)],
+        "images": [
+            {
+                "name": name,
+                "world_from_cam_mm": poses[index],
+                "points": [ids[j] for j in np.flatnonzero(visible[index])],
+                "xy_px": xy_px[index, visible[index]],
+            }
+            for index, name in enumerate(names)
+        ],
+    }
+    before = (out / "truth.json").read_bytes() if (out / "truth.json").is_file() else b""
+    write_json(out / "truth.json", "truth", truth, study_sha256)
+    if before != (out / "truth.json").read_bytes():
+        for stale in (out / "images").glob("*.png"):
+            stale.unlink()
+    image, point = np.nonzero(visible)
+    lines = [
+        f"{names[i]},{ids[j].replace('.', ',')},{xy_px[i, j, 0]:.6f},{xy_px[i, j, 1]:.6f}"
+        for i, j in zip(image, point, strict=True)
+    ]
+    write_text(out / "corners.csv", "\n".join(["image,tag,corner,x_px,y_px", *lines]) + "\n")
+    write_model(
+        out,
+        ColmapModel(
+            cameras=(camera,), camera_ids=(1,), camera_of_image=np.zeros(len(names), np.int64), names=tuple(names),
+            world_from_cam=world_from_cam,
+            point_ids=tuple(point3d_id(int(tag), k) for tag in scene.targets.ids for k in range(CORNERS_PER_TAG)),
+            points=scene.targets.points, image=image, point=point, xy_px=xy_px[image, point],
+        ),
+    )  # fmt: skip
+
+
+def camera_record(camera: Camera) -> dict[str, Any]:
+    """Return a camera with the keys of a study's [camera] table."""
+    return {
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        "focal_px": camera.focal_px,
+        "principal_point_px": camera.principal_point_px,
+        "distortion": camera.distortion,
+        "blur_px": camera.blur_px,
+        "full_well_e": camera.full_well_e,
+        "read_noise_e": camera.read_noise_e,
+    }
+
+
+@lru_cache(maxsize=1)
+def _session(pickled: bytes) -> Photographer:
+    """Keep one prepared scene per process: consecutive pictures share it."""
+    scene, camera, shoot = pickle.loads(pickled)
+    return Photographer(scene, camera, shoot)
+
+
+def _render_one(job: tuple[bytes, int, Floats, Path]) -> None:
+    session, index, world_from_cam, path = job
+    write_bytes(path, png_bytes(_session(session).take(index, world_from_cam)))
+
+
+def _measure_one(job: tuple[Path, Camera, Targets, Gates | None, float]) -> list[TagMeasurement]:
+    path, camera, targets, gates, floor_px = job
+    ids = set(targets.ids.tolist())
+    return measure(read_picture(path), camera, targets.family, targets.size_m, ids, gates, floor_px)
+
+
+def _each(
+    work: Callable[[Any], Any], jobs: Sequence[Any], executor: Executor | None, stage: str, progress: Progress
+) -> Iterator[Any]:
+    """Yield the results of ``work`` in the order of ``jobs``."""
+    futures: list[Future[Any]] = [] if executor is None else [executor.submit(work, job) for job in jobs]
+    for done, job in enumerate(jobs):
+        yield work(job) if executor is None else futures[done].result()
+        progress(stage, done + 1, len(jobs))

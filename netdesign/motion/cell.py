@@ -1,0 +1,144 @@
+"""The robot cell ready for the kernels: chain, capsules, pairs to test, part and obstacles in one value."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from netdesign.errors import InputError
+from netdesign.model.arrays import Floats, Ints
+from netdesign.model.frames import transform
+from netdesign.model.scene import Part
+from netdesign.model.task import RobotCell, ViewingSphere
+from netdesign.motion.capsules import fit_capsules
+from netdesign.motion.collision import Body, part_field
+from netdesign.motion.mesh_collision import MeshCell, camera_capsules, learn_pairs, pairs_key
+from netdesign.motion.robot import Chain, load_chain
+from netdesign.motion.stored import Arrays, content_key, stored
+from netdesign.motion.ur_kinematics import UrArm, ur_arm
+
+_SIGHT_BALLS = 8
+_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmCell:
+    """A loaded cell.
+
+    Attributes:
+        chain: the arm as the URDF has it, base frame = the URDF's root.
+        placed: the same arm from the world to the camera: world_from_base and flange_from_cam folded in.
+        ur: closed form of ``placed``, None for arms built otherwise.
+        body: what the collision kernels take.
+        key: SHA-256 of everything that decides whether a configuration is free.
+    """
+
+    cell: RobotCell
+    chain: Chain
+    placed: Chain
+    ur: UrArm | None
+    body: Body
+    meshes: MeshCell
+    key: str
+
+    @property
+    def weights(self) -> Floats:
+        """(r,) lambda of the source paper."""
+        return np.array(self.cell.joint_weights or np.ones(len(self.chain)), dtype=np.float64)
+
+    @property
+    def coaxial(self) -> bool:
+        """Whether the camera looks along the last joint axis, so that the last joint is the roll."""
+        z, origin = self.placed.last_from_flange[:3, 2], self.placed.last_from_flange[:3, 3]
+        return bool(abs(abs(z[2]) - 1.0) < 1e-9 and np.hypot(origin[0], origin[1]) < 1e-6)
+
+
+def load_arm(cell: RobotCell, sphere: ViewingSphere, part: Part) -> ArmCell:
+    """Load the robot and fit its capsules; what takes long is kept on disk by content.
+
+    Raises:
+        InputError: see ``load_chain``; or joint_weights of another length than the arm has joints.
+    """
+    chain = load_chain(cell)
+    if cell.joint_weights is not None and len(cell.joint_weights) != len(chain):
+        raise InputError(
+            f"robot.joint_weights: expected {len(chain)} numbers ({', '.join(chain.joint_names)}), "
+            f"found {len(cell.joint_weights)}"
+        )
+    placements = np.array(chain.placements)
+    placements[0] = cell.world_from_base @ placements[0]
+    last_from_cam = chain.last_from_flange @ cell.flange_from_cam
+    base_in_world = tuple(
+        replace(shape, vertices=transform(cell.world_from_base, shape.vertices)) if shape.link == 0 else shape
+        for shape in chain.shapes
+    )
+    placed = replace(chain, placements=placements, last_from_flange=last_from_cam, shapes=base_in_world)
+    camera = _moved(camera_capsules(cell), chain.last_from_flange)
+    boxes = np.concatenate([cell.obstacle_centres, 0.5 * cell.obstacle_sizes], axis=1)
+    meshes = MeshCell(placed, camera, part, boxes, cell.margin)
+    meshes.pairs = learn_pairs(meshes, placed, pairs_key(chain, camera))
+    capsules, owner = _capsules(chain)
+    capsules[owner_links(chain, owner) == 0] = _moved(capsules[owner_links(chain, owner) == 0], cell.world_from_base)
+    capsules = np.concatenate([capsules, camera])
+    owner = np.concatenate([owner, len(chain.shapes) + np.arange(len(camera))])
+    field, field_origin, field_step = part_field(part)
+    reach = float(np.linalg.norm(part.vertices - sphere.centre, axis=1).max())
+    share = np.arange(1, _SIGHT_BALLS + 1) / _SIGHT_BALLS
+    body = Body(
+        placements=placements,
+        last_from_cam=last_from_cam,
+        capsules=capsules,
+        capsule_link=np.array(meshes.links, dtype=np.int64)[owner],
+        camera_parts=len(camera),
+        pairs=_capsule_pairs(meshes.pairs, owner),
+        boxes=boxes,
+        mounting=meshes.mounting,
+        field=field,
+        field_origin=field_origin,
+        field_step=field_step,
+        margin=cell.margin,
+        sight=np.stack([share, share * min(reach, 0.5 * sphere.radius)], axis=1),
+        centre=np.array(sphere.centre),
+    )
+    key = content_key("arm cell", _VERSION, chain.lower, chain.upper, *[np.asarray(value) for value in body])
+    return ArmCell(cell=cell, chain=chain, placed=placed, ur=ur_arm(placed), body=body, meshes=meshes, key=key)
+
+
+def _moved(capsules: Floats, target_from_source: Floats) -> Floats:
+    """Return capsules (k, 7) of one frame expressed in another."""
+    return np.concatenate(
+        [
+            transform(target_from_source, capsules[:, :3]),
+            transform(target_from_source, capsules[:, 3:6]),
+            capsules[:, 6:],
+        ],
+        axis=1,
+    )
+
+
+def _capsules(chain: Chain) -> tuple[Floats, Ints]:
+    """Return capsules (c, 7) in link frames and the shape (c,) that each covers part of."""
+
+    def build() -> Arrays:
+        fitted = [fit_capsules(shape.vertices, shape.faces) for shape in chain.shapes]
+        owner = np.repeat(np.arange(len(fitted)), [len(capsules) for capsules in fitted])
+        return {"capsules": np.concatenate(fitted), "owner": owner}
+
+    parts = [value for shape in chain.shapes for value in (shape.vertices, shape.faces)]
+    arrays = stored(content_key("capsules", _VERSION, *parts), build)
+    return arrays["capsules"], arrays["owner"]
+
+
+def owner_links(chain: Chain, owner: Ints) -> Ints:
+    """Return the link (c,) of every capsule from the shape (c,) it covers."""
+    return np.array([shape.link for shape in chain.shapes], dtype=np.int64)[owner]
+
+
+def _capsule_pairs(shape_pairs: Ints, owner: Ints) -> Ints:
+    """Return the pairs of capsules (s, 2) of the pairs of shapes."""
+    pairs = [
+        (first, second)
+        for a, b in shape_pairs.tolist()
+        for first in np.flatnonzero(owner == a).tolist()
+        for second in np.flatnonzero(owner == b).tolist()
+    ]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)

@@ -1,0 +1,273 @@
+"""Joints for every viewing direction, computed once: the inverse kinematics the search can afford.
+
+The viewing sphere is gridded in Lambert's equal-area azimuthal projection about the top view: no pole, cells of one
+area. At every node, roll and branch the map keeps the joints and a state (``collision.REASONS``). A lookup
+interpolates bilinearly between the four nodes around a direction, joint by joint and with whole turns taken out, and
+only where all four are free (conservative). The interpolation is for the search; a plan solves the pose exactly.
+
+Branches are the closed form's labels, or sheets found by flooding the grid (``joint_sheets``).
+
+Disc coordinates of a unit direction u: (ux, uy) sqrt(2 / (1 + uz)); the disc of elevation beta has radius
+2 sin((pi/2 - beta) / 2). Source: J. P. Snyder, Map Projections, USGS Prof. Paper 1395, 1987, chapter 24.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.frames import look_at
+from netdesign.model.scene import Part
+from netdesign.model.task import RobotCell, ViewingSphere
+from netdesign.motion.cell import ArmCell, load_arm
+from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION, REASONS, configuration_state
+from netdesign.motion.joint_sheets import sheets
+from netdesign.motion.kinematics import into_limits
+from netdesign.motion.stored import Arrays, content_key, stored
+from netdesign.motion.ur_kinematics import BRANCHES, ur_branches
+
+_VERSION = 1
+SEARCH_ROLLS = 12
+_GRID_CLOSED = {1: 128, SEARCH_ROLLS: 64}
+_GRID_SHEETS = {1: 64, SEARCH_ROLLS: 36}
+# Neighbouring nodes whose joints differ by more belong to different sheets, or to a singularity.
+_LARGEST_JUMP = 0.8
+
+
+class MapArrays(NamedTuple):
+    """The map as the kernels take it.
+
+    joints (R, G, G, B, r) float32 rad; state (R, G, G, B) int8; half: disc coordinate of the last node; labels (B,):
+    branches, the one with the most free nodes first; most: options a lookup can return.
+    """
+
+    joints: NDArray[np.float32]
+    state: NDArray[np.int8]
+    half: float
+    labels: Ints
+    wraps: Bools
+    most: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointMap:
+    """Joint options over a viewing sphere.
+
+    Attributes:
+        arrays: for the kernels.
+        rolls: (R,) rad, roll of each layer; one layer that leaves the last joint at rest when ``follows`` is set.
+        follows: the camera looks along the last joint's axis and its roll is free: the last joint never moves.
+    """
+
+    arm: ArmCell
+    sphere: ViewingSphere
+    arrays: MapArrays
+    rolls: Floats
+    follows: bool
+
+    @classmethod
+    def build(
+        cls, cell: RobotCell, sphere: ViewingSphere, part: Part, rolls: int | None = None, grid: int | None = None
+    ) -> "JointMap":
+        """Build the map, or take it from the disk cache when nothing it depends on has changed.
+
+        Args:
+            rolls: number of rolls when the sphere leaves the roll free.  grid: nodes along a side of the disc.
+
+        Raises:
+            InputError: see ``motion.robot.load_chain``.
+        """
+        return cls.of_arm(load_arm(cell, sphere, part), sphere, rolls, grid)
+
+    @classmethod
+    def of_arm(
+        cls, arm: ArmCell, sphere: ViewingSphere, rolls: int | None = None, grid: int | None = None
+    ) -> "JointMap":
+        """Build the map of a loaded arm, see ``build``."""
+        follows = sphere.roll is None and arm.coaxial and arm.ur is not None
+        count = (rolls or SEARCH_ROLLS) if sphere.roll is None and not follows else 1
+        angles = np.arange(count) * (2.0 * np.pi / count) + (sphere.roll or 0.0)
+        sizes = _GRID_CLOSED if arm.ur is not None else _GRID_SHEETS
+        size = grid or sizes.get(count, sizes[SEARCH_ROLLS])
+        low = max(sphere.elevation[0], -0.5 * np.pi + 0.02)
+        radius = 2.0 * np.sin(0.25 * np.pi - 0.5 * low)
+        half = float(radius * (1.0 + 3.0 / (size - 1)))
+        targets = _targets(sphere, angles, size, half)
+        key = content_key("joint map", _VERSION, arm.key, targets, follows)
+        kept = stored(key, lambda: _fill(arm, targets, follows))
+        free = (kept["state"] == FREE).sum(axis=(0, 1, 2))
+        labels = np.argsort(-free, kind="stable").astype(np.int64)
+        most = len(labels) if count == 1 else count
+        arrays = MapArrays(kept["joints"], kept["state"], half, labels, np.array(arm.placed.wraps), most)
+        return cls(arm=arm, sphere=sphere, arrays=arrays, rolls=angles, follows=follows)
+
+    def options(self, viewpoints: Floats) -> tuple[Floats, Ints]:
+        """Return interpolated joints (n, r, K) rad and how many of the K are valid (n,), viewpoints (n, 2)."""
+        count = len(viewpoints)
+        joints = np.zeros((count, self.arrays.joints.shape[-1], self.arrays.most))
+        return joints, np.array([options_at(self.arrays, *viewpoints[i], joints[i]) for i in range(count)])
+
+    def reachable(self, viewpoints: Floats) -> Bools:
+        """Return whether each of viewpoints (n, 2) has a free option."""
+        return self.options(viewpoints)[1] > 0
+
+    def reasons(self, viewpoints: Floats) -> list[str]:
+        """Return, for viewpoints (n, 2), the reason of the best option at the nearest node, "free" where reachable."""
+        directions = np.stack(_disc(viewpoints), axis=-1)
+        size = self.arrays.state.shape[1]
+        node = np.clip(np.rint((directions / self.arrays.half + 1.0) * 0.5 * (size - 1)), 0, size - 1).astype(int)
+        best = [_best_state(self.arrays.state[:, i, j]) for i, j in node]
+        free = self.reachable(viewpoints)
+        # Free at the nearest node but not at all four around: the edge of a region; the neighbours say of which.
+        edge = [
+            _best_state(self.arrays.state[:, max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2], worst=True) for i, j in node
+        ]
+        return [
+            REASONS[FREE] if ok else REASONS[state if state != FREE else around]
+            for ok, state, around in zip(free.tolist(), best, edge, strict=True)
+        ]
+
+    def share(self, elevation: tuple[float, float] | None = None, samples: int = 20000) -> dict[str, float]:
+        """Return the share of the sphere's admissible area for each reason, from equal-area sample viewpoints."""
+        low, high = elevation or self.sphere.elevation
+        alpha_low, alpha_high = self.sphere.azimuth
+        rng = np.random.default_rng(0)
+        beta = np.arcsin(rng.uniform(np.sin(low), np.sin(high), samples))
+        alpha = rng.uniform(alpha_low, alpha_high, samples)
+        found = self.reasons(np.stack([alpha, beta], axis=1))
+        return {reason: found.count(reason) / samples for reason in REASONS}
+
+
+def _best_state(states: NDArray[np.int8], worst: bool = False) -> int:
+    """Return FREE if any option is free, else the state that came furthest along the tests, as a count decides."""
+    counts = np.bincount(states.ravel(), minlength=len(REASONS))
+    if not worst and counts[FREE]:
+        return FREE
+    refused = counts[NO_SOLUTION + 1 :]
+    return int(refused.argmax()) + NO_SOLUTION + 1 if refused.any() else NO_SOLUTION
+
+
+def _disc(viewpoints: Floats) -> tuple[Any, Any]:
+    alpha, beta = viewpoints[:, 0], viewpoints[:, 1]
+    radius = 2.0 * np.sin(0.25 * np.pi - 0.5 * beta)
+    return radius * np.cos(alpha), radius * np.sin(alpha)
+
+
+def _targets(sphere: ViewingSphere, rolls: Floats, size: int, half: float) -> Floats:
+    """Return world_from_cam (R, G, G, 4, 4) of every node; all zero where the disc has no direction."""
+    steps = np.linspace(-half, half, size)
+    x, y = np.meshgrid(steps, steps, indexing="ij")
+    square = x * x + y * y
+    inside = (square < 4.0 - 1e-6) & (square <= half * half)
+    scale = np.sqrt(np.maximum(1.0 - 0.25 * square, 0.0))
+    outward = np.stack([x * scale, y * scale, 1.0 - 0.5 * square], axis=-1)
+    outward[~inside] = (0.0, 0.0, 1.0)
+    poses = np.stack([look_at(sphere.centre + sphere.radius * outward, sphere.centre, roll) for roll in rolls])
+    poses[:, ~inside] = 0.0
+    return poses
+
+
+def _fill(arm: ArmCell, targets: Floats, follows: bool) -> Arrays:
+    """Return joints (R, G, G, B, r) and states (R, G, G, B) at targets (R, G, G, 4, 4)."""
+    shape = targets.shape[:3]
+    if arm.ur is None:
+        solved, found = sheets(arm.placed, targets)
+    else:
+        solved = np.zeros((*shape, BRANCHES, 6))
+        found = np.zeros((*shape, BRANCHES), dtype=np.bool_)
+        _solve_closed(arm, targets.reshape(-1, 4, 4), solved.reshape(-1, BRANCHES, 6), found.reshape(-1, BRANCHES))
+    count, r = found.shape[-1], solved.shape[-1]
+    rest = float(np.clip(0.0, arm.placed.lower[-1], arm.placed.upper[-1])) if follows else math.nan
+    state = _states_of(
+        arm.body, arm.placed.lower, arm.placed.upper, solved.reshape(-1, r), found.reshape(-1), rest
+    )  # fmt: skip
+    return {"joints": solved.astype(np.float32), "state": state.reshape(*shape, count)}
+
+
+def _solve_closed(arm: ArmCell, targets: Floats, solved: Floats, found: Bools) -> None:
+    """Fill joints (N, 8, 6) and found (N, 8) of targets (N, 4, 4) by the closed form."""
+    assert_ur = arm.ur
+    if assert_ur is not None:
+        _closed(
+            assert_ur.axes, assert_ur.points, assert_ur.wrist, assert_ur.flange_inverse, targets, solved, found
+        )
+
+
+@njit(cache=True, error_model="numpy")
+def _closed(axes, points, wrist, flange_inverse, targets, solved, found):  # type: ignore[no-untyped-def]
+    for node in range(targets.shape[0]):
+        if targets[node, 3, 3] == 1.0:
+            ur_branches(axes, points, wrist, flange_inverse, targets[node], solved[node], found[node])
+
+
+@njit(cache=True, error_model="numpy")
+def _states_of(body, lower, upper, joints, found, rest):  # type: ignore[no-untyped-def]
+    """Bring joints (N, r) into their limits in place and return their states (N,) int8.
+
+    ``rest``: value of the last joint everywhere, NaN to leave it.
+    """
+    count, r = joints.shape
+    links, placed = np.empty((r, 3, 4)), np.empty((body.capsules.shape[0], 6))
+    state = np.full(count, NO_SOLUTION, dtype=np.int8)
+    for i in range(count):
+        if not found[i]:
+            continue
+        if not math.isnan(rest):
+            joints[i, r - 1] = rest
+        if into_limits(joints[i], lower, upper):
+            state[i] = configuration_state(body, joints[i], links, placed)
+        else:
+            state[i] = LIMITS
+    return state
+
+
+@njit(cache=True, error_model="numpy")
+def options_at(arrays, alpha, beta, out):  # type: ignore[no-untyped-def]
+    """Write the free options of a viewing direction into out (r, K), option by column; return how many there are.
+
+    With one roll every branch is an option. With more, every roll of the first label that has one: one branch for a
+    whole tour costs little, and the search stays cheap (robot notes, section 2).
+    """
+    rolls, size, branches, r = (
+        arrays.state.shape[0], arrays.state.shape[1], arrays.state.shape[3], arrays.joints.shape[4],
+    )  # fmt: skip
+    radius = 2.0 * math.sin(0.25 * math.pi - 0.5 * beta)
+    x = (radius * math.cos(alpha) / arrays.half + 1.0) * 0.5 * (size - 1)
+    y = (radius * math.sin(alpha) / arrays.half + 1.0) * 0.5 * (size - 1)
+    i, j = int(x), int(y)
+    if x < 0.0 or y < 0.0 or i > size - 2 or j > size - 2:
+        return 0
+    u, v = x - i, y - j
+    turn = 2.0 * math.pi
+    count = 0
+    for position in range(branches):
+        b = arrays.labels[position]
+        for k in range(rolls):
+            s = arrays.state
+            if s[k, i, j, b] or s[k, i + 1, j, b] or s[k, i, j + 1, b] or s[k, i + 1, j + 1, b]:
+                continue
+            smooth = True
+            for a in range(r):
+                q0 = float(arrays.joints[k, i, j, b, a])
+                d1 = float(arrays.joints[k, i + 1, j, b, a]) - q0
+                d2 = float(arrays.joints[k, i, j + 1, b, a]) - q0
+                d3 = float(arrays.joints[k, i + 1, j + 1, b, a]) - q0
+                if arrays.wraps[a]:
+                    d1 -= turn * math.floor(d1 / turn + 0.5)
+                    d2 -= turn * math.floor(d2 / turn + 0.5)
+                    d3 -= turn * math.floor(d3 / turn + 0.5)
+                if abs(d1) > _LARGEST_JUMP or abs(d2) > _LARGEST_JUMP or abs(d3) > _LARGEST_JUMP:
+                    smooth = False
+                    break
+                out[a, count] = q0 + u * (1.0 - v) * d1 + (1.0 - u) * v * d2 + u * v * d3
+            if smooth:
+                count += 1
+                if count == out.shape[1]:
+                    return count
+        if rolls > 1 and count:
+            return count
+    return count

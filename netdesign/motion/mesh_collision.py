@@ -1,0 +1,178 @@
+"""The final word on collisions: coal on the real meshes.
+
+Self pairs are those that touch in some sampled configurations and not in nearly all: neighbours always touch, and a
+pair that never does in thousands of samples is left out of the capsule test too, where it may give false alarms.
+"""
+
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+
+from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.frames import pose
+from netdesign.model.scene import Part
+from netdesign.model.task import RobotCell
+from netdesign.motion.kinematics import link_poses, restarts
+from netdesign.motion.robot import Chain
+from netdesign.motion.stored import Arrays, content_key, stored
+
+_SAMPLES = 3000
+_NEARLY_ALWAYS = 0.95
+_BRACKET_RADIUS = 0.02
+
+
+def camera_capsules(cell: RobotCell) -> Floats:
+    """Return the camera's body and its bracket as capsules (2, 7) m in the flange frame."""
+    body = np.array([[0.0, 0.0, -cell.camera_radius], [0.0, 0.0, -max(cell.camera_length - cell.camera_radius, 0.0)]])
+    ends = body @ cell.flange_from_cam[:3, :3].T + cell.flange_from_cam[:3, 3]
+    bracket = np.concatenate([np.zeros(3), ends.mean(axis=0), [min(_BRACKET_RADIUS, cell.camera_radius)]])
+    return np.stack([np.concatenate([ends.ravel(), [cell.camera_radius]]), bracket])
+
+
+@dataclass(frozen=True)
+class _Solid:
+    """A coal object that moves with a link."""
+
+    name: str
+    link: int
+    link_from_solid: Floats
+    item: coal.CollisionObject
+
+
+class MeshCell:
+    """The arm, its camera, the part and the obstacles as coal objects.
+
+    Args:
+        chain: in the world frame (``ArmCell.placed``); camera: capsules (k, 7) in the last link's frame.
+        part: None without one.
+        boxes: (b, 6) centre and half edges in the world.
+        margin: m kept from part and boxes.
+    """
+
+    def __init__(self, chain: Chain, camera: Floats, part: Part | None, boxes: Floats, margin: float) -> None:
+        self._placements = np.array(chain.placements)
+        self._links = np.empty((len(chain), 3, 4))
+        self._solids = [
+            _Solid(shape.name, shape.link, np.eye(4), coal.CollisionObject(_mesh(shape.vertices, shape.faces)))
+            for shape in chain.shapes
+        ]
+        self._solids += [_capsule("camera", len(chain), capsule) for capsule in camera]
+        self._around = [] if part is None else [("the part", coal.CollisionObject(_mesh(part.vertices, part.faces)))]
+        for index, box in enumerate(boxes):
+            item = coal.CollisionObject(coal.Box(*(2.0 * box[3:])))
+            item.setTranslation(box[:3])
+            self._around.append((f"obstacle {index + 1}", item))
+        for _, item in self._around:
+            item.computeAABB()
+        self.pairs: Ints = np.zeros((0, 2), dtype=np.int64)
+        self._mounting: frozenset[str] = frozenset()
+        self._touch = coal.CollisionRequest(coal.CollisionRequestFlag.NO_REQUEST, 1)
+        self._near = coal.CollisionRequest(coal.CollisionRequestFlag.NO_REQUEST, 1)
+        self._near.security_margin = margin
+        self.place(np.zeros(len(chain)))
+        # What the base stands on is as near to the first moving link as a neighbouring link is.
+        self._mounting = frozenset(
+            name
+            for name, item in self._around
+            for solid in self._solids
+            if solid.link == 0 and coal.collide(solid.item, item, self._near, coal.CollisionResult())
+        )
+
+    def place(self, q: Floats) -> None:
+        """Move every solid to joints q (r,)."""
+        link_poses(self._placements, np.ascontiguousarray(q, dtype=np.float64), self._links)
+        for solid in self._solids:
+            base_from_solid = solid.link_from_solid[:3]
+            if solid.link:
+                link = self._links[solid.link - 1]
+                base_from_solid = link[:, :3] @ base_from_solid
+                base_from_solid[:, 3] += link[:, 3]
+            solid.item.setTransform(coal.Transform3s(base_from_solid[:, :3], base_from_solid[:, 3]))
+
+    def touching(self, first: int, second: int) -> bool:
+        """Return whether two solids of the arm touch where they stand now."""
+        result = coal.CollisionResult()
+        return bool(coal.collide(self._solids[first].item, self._solids[second].item, self._touch, result))
+
+    def contact(self, q: Floats) -> str:
+        """Return what touches what at joints q (r,), "" when nothing does (margin to part and obstacles included)."""
+        self.place(q)
+        for solid in self._solids:
+            if solid.link == 0:
+                continue
+            for name, item in self._around:
+                if solid.link == 1 and name in self._mounting:
+                    continue
+                if coal.collide(solid.item, item, self._near, coal.CollisionResult()):
+                    return f"{solid.name} touches {name}"
+        for first, second in self.pairs.tolist():
+            if self.touching(first, second):
+                return f"{self._solids[first].name} touches {self._solids[second].name}"
+        return ""
+
+    def leg_contact(self, start: Floats, end: Floats, step: float) -> str:
+        """Return the first contact on the straight joint line from start to end (r,), tested every ``step`` rad."""
+        count = max(int(np.ceil(np.abs(end - start).max() / step)), 1)
+        for share in np.linspace(0.0, 1.0, count + 1):
+            found = self.contact(start + share * (end - start))
+            if found:
+                return found
+        return ""
+
+    @property
+    def mounting(self) -> Bools:
+        """(b,) whether the base stands on that obstacle: link 1 is not tested against it."""
+        names = [name for name, _ in self._around if name.startswith("obstacle")]
+        return np.array([name in self._mounting for name in names], dtype=np.bool_)
+
+    @property
+    def links(self) -> list[int]:
+        """The link of every solid, 0 the base."""
+        return [solid.link for solid in self._solids]
+
+
+def learn_pairs(meshes: MeshCell, chain: Chain, key: str) -> Ints:
+    """Return the pairs of solids (s, 2) that can touch: sampled with the real meshes, seeded, kept on disk.
+
+    Neighbouring links are left out, and so are solids on the same link.
+    """
+
+    def build() -> Arrays:
+        links = np.array(meshes.links)
+        candidates = [
+            (a, b) for a in range(len(links)) for b in range(a + 1, len(links)) if abs(int(links[a] - links[b])) > 1
+        ]
+        hits = np.zeros(len(candidates))
+        for q in restarts(chain, _SAMPLES, seed=1):
+            meshes.place(q)
+            hits += [meshes.touching(a, b) for a, b in candidates]
+        kept: Bools = (hits > 0) & (hits < _NEARLY_ALWAYS * _SAMPLES)
+        return {"pairs": np.array(candidates, dtype=np.int64).reshape(-1, 2)[kept]}
+
+    return stored(key, build)["pairs"]
+
+
+def pairs_key(chain: Chain, camera: Floats) -> str:
+    """Return the content key of everything that decides which parts of the arm can touch."""
+    shapes = [value for shape in chain.shapes for value in (shape.vertices, shape.faces, shape.link)]
+    return content_key("self pairs 1", chain.placements[1:], chain.lower, chain.upper, camera, *shapes)
+
+
+def _mesh(vertices: Floats, faces: Ints) -> coal.BVHModelOBBRSS:
+    model = coal.BVHModelOBBRSS()
+    model.beginModel(len(faces), len(vertices))
+    model.addVertices(np.ascontiguousarray(vertices, dtype=np.float64))
+    model.addTriangles(np.ascontiguousarray(faces))
+    model.endModel()
+    return model
+
+
+def _capsule(name: str, link: int, capsule: Floats) -> _Solid:
+    start, end = capsule[:3], capsule[3:6]
+    length = float(np.linalg.norm(end - start))
+    z = (end - start) / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    x = x / np.linalg.norm(x)
+    placement = pose(np.stack([x, np.cross(z, x), z], axis=1), 0.5 * (start + end))
+    return _Solid(name, link, placement, coal.CollisionObject(coal.Capsule(float(capsule[6]), length)))

@@ -1,0 +1,296 @@
+"""The only file that meets pinocchio: a URDF becomes plain arrays.
+
+A ``Chain`` is the path of revolute joints from the robot's root to the frame that carries the camera. Every link frame
+is turned so that its joint rotates about its own z axis, so that the kernels need one kind of joint only:
+
+    base_from_flange = placements[0] Rz(q0) placements[1] Rz(q1) … placements[r-1] Rz(q[r-1]) last_from_flange
+"""
+
+import importlib.metadata
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from scipy.spatial import ConvexHull
+
+from netdesign.errors import EnvironmentProblem, InputError
+from netdesign.model.arrays import Bools, Floats, Ints, frozen
+from netdesign.model.frames import inverse, pose, skew
+from netdesign.model.task import RobotCell
+
+# Frame of the bare flange of the arms of example-robot-data; tool0 and flange are ROS-Industrial's names (REP 199).
+_FLANGES = {
+    "panda": "panda_link8",
+    "xarm7": "link_eef",
+    "kinova": "j2s6s200_end_effector",
+    "z1": "link06",
+}
+_STANDARD_FLANGES = ("tool0", "flange")
+# A continuous joint may turn for ever, its cables may not: one and a half turns to either side.
+_CONTINUOUS_LIMIT = 3.0 * np.pi
+_TURN = 2.0 * np.pi
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkShape:
+    """The collision mesh of a link.
+
+    Attributes:
+        link: 0 for the base, i + 1 for the link that joint i moves.
+        vertices: (v, 3) m in that link's frame of the ``Chain``.  faces: (t, 3).
+    """
+
+    name: str
+    link: int
+    vertices: Floats
+    faces: Ints
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chain:
+    """A serial arm of r revolute joints, each about the z axis of its own link frame.
+
+    Attributes:
+        placements: (r, 4, 4) m, previous link frame from this link's frame at joint value 0.
+        last_from_flange: (4, 4) m.
+        lower, upper: (r,) rad; a continuous joint has ±3 pi.
+        wraps: (r,) whether the joint can stand at one angle in more than one turn.
+        speed, acceleration: (r,) rad/s and rad/s², already the smaller of URDF and study.
+        controller_from_base: (4, 4), the frame called "base" (ROS-Industrial: what the controller calls its base)
+            from the URDF's root.
+        shapes: collision meshes; a gripper behind or beside the flange is left out, the camera stands in its place.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    placements: Floats
+    last_from_flange: Floats
+    lower: Floats
+    upper: Floats
+    wraps: Bools
+    speed: Floats
+    acceleration: Floats
+    controller_from_base: Floats
+    shapes: tuple[LinkShape, ...]
+
+    def __post_init__(self) -> None:
+        count = len(self.joint_names)
+        object.__setattr__(self, "placements", frozen("placements", self.placements, (count, 4, 4)))
+        object.__setattr__(self, "last_from_flange", frozen("last_from_flange", self.last_from_flange, (4, 4)))
+        for name in ("lower", "upper", "speed", "acceleration"):
+            object.__setattr__(self, name, frozen(name, getattr(self, name), (count,)))
+        object.__setattr__(self, "wraps", frozen("wraps", self.wraps, (count,), np.bool_))
+
+    def __len__(self) -> int:
+        return len(self.joint_names)
+
+
+def find_robot(name: str) -> tuple[Path, tuple[Path, ...], str | None]:
+    """Return (URDF, package directories, flange frame) of a robot of example-robot-data.
+
+    The flange is None for a robot whose flange is not known here: the study then names ``tool_frame``.
+
+    Raises:
+        EnvironmentProblem: example-robot-data is not installed.
+        InputError: no such robot; names the nearest ones.
+    """
+    try:
+        files = importlib.metadata.files("example-robot-data") or []
+    except importlib.metadata.PackageNotFoundError:
+        raise EnvironmentProblem("robot models: expected the package example-robot-data, found none installed") from None
+    known = {file.name.removesuffix(".urdf"): file for file in files if file.name.endswith(".urdf")}
+    found = known.get(f"{name}_robot") or known.get(name)
+    if found is None:
+        names = sorted({stem.removesuffix("_robot") for stem in known})
+        near = get_close_matches(name, names, n=4, cutoff=0.4) or names
+        raise InputError(f"robot.name: expected a robot of example-robot-data ({', '.join(near)}, …), found {name!r}")
+    urdf = Path(str(found.locate())).resolve()
+    # package://example-robot-data/robots/… is resolved against the folder that holds the package's folder.
+    share = next(parent for parent in urdf.parents if parent.name == "share")
+    return urdf, (share,), _FLANGES.get(name, "tool0" if name.startswith("ur") else None)
+
+
+def mount(name: str) -> Floats:
+    """Return flange_from_cam (4, 4) m of the two camera mounts: "side" looks along flange y, "coaxial" along z.
+
+    Raises:
+        InputError: another name.
+    """
+    if name == "side":
+        return pose(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.array([0.0, 0.06, 0.06]))
+    if name == "coaxial":
+        return pose(np.eye(3), np.array([0.0, 0.0, 0.09]))
+    raise InputError(f'robot.camera_mount: expected "side" or "coaxial", found {name!r}')
+
+
+def load_chain(cell: RobotCell) -> Chain:
+    """Read the URDF of the cell: locked joints become rigid, joints that do not move the flange stay at rest.
+
+    Raises:
+        InputError: no such file, not a URDF, a missing mesh, an unknown frame or joint, a joint that does not rotate.
+    """
+    if not cell.urdf.is_file():
+        raise InputError(f"robot.urdf: expected a URDF file, found no file {cell.urdf}")
+    try:
+        model = pin.buildModelFromUrdf(str(cell.urdf))
+        folders = [str(folder) for folder in (*cell.package_dirs, cell.urdf.parent)]
+        geometry = pin.buildGeomFromUrdf(model, str(cell.urdf), pin.GeometryType.COLLISION, package_dirs=folders)
+    except ValueError as error:
+        raise InputError(f"robot.urdf: {cell.urdf.name}: {' '.join(str(error).split())}") from None
+    tool = _tool_frame(model, cell)
+    model, geometry, tool = _reduce(model, geometry, tool, cell)
+    joints = list(range(1, model.njoints))
+    _check_serial(model, cell)
+    # `turned[i]`: the joint's own frame in pinocchio from our link frame, whose z is the joint axis.
+    turned = [np.eye(4)] + [pose(_z_to(_axis(model, joint)), np.zeros(3)) for joint in joints]
+    placements = [
+        inverse(turned[joint - 1]) @ model.jointPlacements[joint].homogeneous @ turned[joint] for joint in joints
+    ]
+    names = tuple(model.names[joint] for joint in joints)
+    lower, upper = _limits(model, names, cell)
+    urdf_speed = np.where(model.velocityLimit > 0, model.velocityLimit, np.inf)
+    frame = model.frames[tool]
+    base = model.getFrameId("base") if model.existFrame("base") else 0
+    base_from_controller = model.frames[base].placement.homogeneous if model.frames[base].parentJoint == 0 else np.eye(4)
+    return Chain(
+        name=cell.name,
+        joint_names=names,
+        placements=np.array(placements),
+        last_from_flange=inverse(turned[frame.parentJoint]) @ frame.placement.homogeneous,
+        lower=lower,
+        upper=upper,
+        wraps=upper - lower > _TURN + 1e-6,
+        speed=np.minimum(urdf_speed, cell.speed),
+        acceleration=np.full(len(names), cell.acceleration),
+        controller_from_base=inverse(base_from_controller),
+        shapes=_shapes(model, geometry, tool, turned),
+    )
+
+
+def _tool_frame(model: Any, cell: RobotCell) -> str:
+    """Return the name of the frame that carries the camera."""
+    names = [frame.name for frame in model.frames if frame.type != pin.FrameType.JOINT]
+    wanted = cell.tool_frame or next((name for name in _STANDARD_FLANGES if name in names), None)
+    if wanted is None:
+        raise InputError(f"robot.tool_frame: expected the frame that carries the camera, one of {', '.join(names)}")
+    if wanted not in names:
+        near = get_close_matches(wanted, names, n=3, cutoff=0.4)
+        hint = f" (nearest: {', '.join(near)})" if near else ""
+        raise InputError(f"robot.tool_frame: expected one of {', '.join(names)}; found {wanted!r}{hint}")
+    return wanted
+
+
+def _reduce(model: Any, geometry: Any, tool: str, cell: RobotCell) -> tuple[Any, Any, int]:
+    """Return model and geometry with every joint locked that is locked by the study or does not move the flange."""
+    moving = set(model.supports[model.frames[model.getFrameId(tool)].parentJoint].tolist())
+    known = list(model.names)[1:]
+    rest = pin.neutral(model)
+    for name, value in cell.lock.items():
+        if name not in known:
+            raise InputError(f"robot.lock: expected one of {', '.join(known)}; found {name!r}")
+        joint = model.joints[model.getJointId(name)]
+        rest[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+    locked = [
+        index for index in range(1, model.njoints) if index not in moving or model.names[index] in cell.lock
+    ]
+    reduced, (shapes,) = pin.buildReducedModel(model, [geometry], locked, rest)
+    if reduced.njoints < 2:
+        raise InputError(f"robot.tool_frame: expected a frame that joints move, found {tool!r} fixed to the base")
+    return reduced, shapes, reduced.getFrameId(tool)
+
+
+def _check_serial(model: Any, cell: RobotCell) -> None:
+    for index in range(1, model.njoints):
+        kind = model.joints[index].shortname()
+        if model.joints[index].nv != 1 or "JointModelR" not in kind:
+            raise InputError(
+                f"robot.urdf: {cell.urdf.name}: joint {model.names[index]}: expected a revolute or continuous joint, "
+                f"found {kind.removeprefix('JointModel')}; lock it"
+            )
+    if model.nv > 7:
+        raise InputError(f"robot.urdf: {cell.urdf.name}: expected at most 7 moving joints, found {model.nv}; lock some")
+
+
+def _axis(model: Any, joint: int) -> Floats:
+    """Return the joint axis (3,) in the joint's own frame: the local Jacobian's rotational part."""
+    data = model.createData()
+    column = model.joints[joint].idx_v
+    jacobian = pin.computeJointJacobian(model, data, pin.neutral(model), joint)
+    return np.asarray(jacobian[3:, column])
+
+
+def _z_to(axis: Floats) -> Floats:
+    """Return the smallest rotation (3, 3) that takes z to a unit axis."""
+    if axis[2] < -1.0 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    cross = skew(np.cross([0.0, 0.0, 1.0], axis))
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + axis[2]))
+
+
+def _limits(model: Any, names: tuple[str, ...], cell: RobotCell) -> tuple[Floats, Floats]:
+    lower, upper = np.empty(len(names)), np.empty(len(names))
+    for index, name in enumerate(names):
+        joint = model.joints[index + 1]
+        continuous = joint.nq == 2
+        low, high = (
+            (-_CONTINUOUS_LIMIT, _CONTINUOUS_LIMIT)
+            if continuous
+            else (model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q])
+        )
+        low, high = cell.limits.get(name, (low, high))
+        if not (np.isfinite([low, high]).all() and low < high):
+            raise InputError(f"robot.limits_rad.{name}: expected low < high, found [{low:g}, {high:g}]")
+        lower[index], upper[index] = low, high
+    unknown = sorted(set(cell.limits) - set(names))
+    if unknown:
+        raise InputError(f"robot.limits_rad: expected one of {', '.join(names)}; found {unknown[0]!r}")
+    return lower, upper
+
+
+def _shapes(model: Any, geometry: Any, tool: int, turned: list[Floats]) -> tuple[LinkShape, ...]:
+    """Return the collision meshes in our link frames, without what hangs behind or beside the flange."""
+    ancestors, frame = {0}, tool
+    while frame not in ancestors:
+        ancestors.add(frame)
+        frame = model.frames[frame].parentFrame
+    last = model.njoints - 1
+    shapes = []
+    for item in geometry.geometryObjects:
+        if item.parentJoint == last and item.parentFrame not in ancestors:
+            continue
+        vertices, faces = _triangles(item.geometry, item.name)
+        link_from_shape = inverse(turned[item.parentJoint]) @ item.placement.homogeneous
+        moved = vertices @ link_from_shape[:3, :3].T + link_from_shape[:3, 3]
+        shapes.append(LinkShape(name=item.name, link=item.parentJoint, vertices=moved, faces=faces))
+    return tuple(shapes)
+
+
+def _triangles(shape: Any, name: str) -> tuple[Floats, Ints]:
+    """Return vertices (v, 3) and faces (t, 3) of a collision shape; a round one is covered from outside."""
+    kind = type(shape).__name__
+    if kind.startswith("BVHModel"):
+        corners = [shape.tri_indices(index) for index in range(shape.num_tris)]
+        faces = [[corner[0], corner[1], corner[2]] for corner in corners]
+        return np.array(shape.vertices()), np.array(faces, dtype=np.int64)
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
+    if kind == "Box":
+        return _hull(signs * np.asarray(shape.halfSide))
+    if kind in ("Cylinder", "Cone", "Capsule", "Sphere"):
+        half = getattr(shape, "halfLength", 0.0) + (shape.radius if kind in ("Capsule", "Sphere") else 0.0)
+        angles = np.arange(16) * (_TURN / 16)
+        ring = shape.radius / np.cos(np.pi / 16) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        return _hull(np.array([[x, y, z] for x, y in ring for z in (-half, half)]))
+    raise InputError(f"robot.urdf: {name}: expected a mesh, box, cylinder, capsule or sphere, found {kind}")
+
+
+def _hull(points: Floats) -> tuple[Floats, Ints]:
+    hull = ConvexHull(points)
+    faces = hull.simplices.astype(np.int64)
+    corners = points[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, [0, 2, 1]]
+    return points, faces

@@ -1,0 +1,172 @@
+"""Closed-form inverse kinematics of arms built like Universal Robots': all eight branches.
+
+Needs, of the joint axes at joint values zero: 2, 3 and 4 parallel (direction h), 1 perpendicular to h, 5 perpendicular
+to h, 5 and 6 meeting in a point w. That is read from the chain, not from a model name. With e_i the rotation about axis
+i (product of exponentials) and G = base_from_flange(q) base_from_flange(0)^-1 = e1 e2 e3 e4 e5 e6:
+
+* w stays under e5 e6, and e2 e3 e4 keep every point's height along h: h·(e1^-1 G w) = h·w gives q1 (two: shoulder);
+* h·(R5 a6) = h·(R1^T R_G a6), a6 the direction of axis 6, gives q5 (two: wrist);
+* R6^T (R5^T h) = R_G^T R1 h gives q6;
+* what is left is a planar arm e2 e3 e4 = e1^-1 G (e5 e6)^-1: q3 by the law of cosines (two: elbow), then q2 and q4.
+
+Branch label = 4 shoulder + 2 wrist + elbow, stable over the workspace.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from netdesign.model.arrays import Floats, frozen
+from netdesign.model.frames import inverse
+from netdesign.motion.kinematics import base_from_flange
+from netdesign.motion.robot import Chain
+
+BRANCHES = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class UrArm:
+    """The geometry of the closed form, base frame, joint values zero.
+
+    Attributes:
+        axes: (6, 3) unit directions.  points: (4, 3) m on axes 1 to 4.  wrist: (3,) m, where axes 5 and 6 meet.
+        flange_inverse: (4, 4), base_from_flange(0)^-1.
+    """
+
+    axes: Floats
+    points: Floats
+    wrist: Floats
+    flange_inverse: Floats
+
+    def __post_init__(self) -> None:
+        for name, shape in (("axes", (6, 3)), ("points", (4, 3)), ("wrist", (3,)), ("flange_inverse", (4, 4))):
+            object.__setattr__(self, name, frozen(name, getattr(self, name), shape))
+
+
+def ur_arm(chain: Chain, tolerance: float = 1e-9) -> UrArm | None:
+    """Return the closed form's geometry, or None for an arm that is built otherwise."""
+    if len(chain) != 6:
+        return None
+    base_from_link = np.eye(4)
+    axes, points = [], []
+    for placement in chain.placements:
+        base_from_link = base_from_link @ placement
+        axes.append(base_from_link[:3, 2])
+        points.append(base_from_link[:3, 3])
+    a = np.array(axes)
+    parallel = max(np.linalg.norm(np.cross(a[1], a[2])), np.linalg.norm(np.cross(a[1], a[3])))
+    square = max(abs(a[0] @ a[1]), abs(a[4] @ a[3]))
+    across = np.cross(a[4], a[5])
+    if parallel > tolerance or square > tolerance or np.linalg.norm(across) < 0.1:
+        return None
+    offset = points[5] - points[4]
+    if abs(offset @ across) > tolerance:
+        return None
+    # The point of axis 5 that lies on axis 6: solve s a5 - t a6 = offset in the least-squares sense.
+    (along, _), *_ = np.linalg.lstsq(np.stack([a[4], -a[5]], axis=1), offset, rcond=None)
+    flange = base_from_flange(chain, np.zeros((1, 6)))[0]
+    return UrArm(axes=a, points=points[:4], wrist=points[4] + along * a[4], flange_inverse=inverse(flange))
+
+
+@njit(cache=True, error_model="numpy")
+def _rotation(axis, angle):  # type: ignore[no-untyped-def]
+    c, s = math.cos(angle), math.sin(angle)
+    x, y, z = axis
+    t = 1.0 - c
+    return np.array(
+        [
+            [c + t * x * x, t * x * y - s * z, t * x * z + s * y],
+            [t * x * y + s * z, c + t * y * y, t * y * z - s * x],
+            [t * x * z - s * y, t * y * z + s * x, c + t * z * z],
+        ]
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _angle_about(axis, start, end):  # type: ignore[no-untyped-def]
+    """Return the angle about a unit axis that takes the part of ``start`` normal to it to that of ``end``."""
+    cross = np.cross(start, end)
+    return math.atan2(
+        axis[0] * cross[0] + axis[1] * cross[1] + axis[2] * cross[2],
+        np.dot(start, end) - np.dot(axis, start) * np.dot(axis, end),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _two_angles(a, b, c):  # type: ignore[no-untyped-def]
+    """Return (middle, half) of the two solutions middle ± half of a cos x + b sin x = c; half < 0 when none.
+
+    A value past the edge by rounding counts as the edge: the caller closes the pose again.
+    """
+    length = math.hypot(a, b)
+    if length < 1e-12:
+        return 0.0, -1.0
+    ratio = c / length
+    if abs(ratio) > 1.0 + 1e-9:
+        return 0.0, -1.0
+    return math.atan2(b, a), math.acos(min(max(ratio, -1.0), 1.0))
+
+
+@njit(cache=True, error_model="numpy")
+def ur_branches(axes, points, wrist, flange_inverse, target, q, found):  # type: ignore[no-untyped-def]
+    """Write the joints of every branch into q (8, 6), each in (-pi, pi], and whether it exists into found (8,).
+
+    target: base_from_flange (4, 4). Limits are not looked at.
+    """
+    found[:] = False
+    g = target @ flange_inverse
+    turn = np.ascontiguousarray(g[:3, :3])
+    shift = np.ascontiguousarray(g[:3, 3])
+    a1, h, a5, a6 = axes[0], axes[1], axes[4], axes[5]
+    # Signs that make joints 3 and 4 turn about h itself.
+    sign3 = 1.0 if np.dot(axes[2], h) > 0.0 else -1.0
+    sign4 = 1.0 if np.dot(axes[3], h) > 0.0 else -1.0
+    moved = turn @ wrist + shift - points[0]
+    # h·(R(-q1) moved) = moved·(R(q1) h); R(q1) h = h cos + (a1 x h) sin since h is normal to a1.
+    side = np.cross(a1, h)
+    middle1, half1 = _two_angles(np.dot(moved, h), np.dot(moved, side), np.dot(wrist - points[0], h))
+    if half1 < 0.0:
+        return
+    link2 = points[2] - points[1]
+    link3 = points[3] - points[2]
+    link2 = link2 - np.dot(link2, h) * h
+    link3 = link3 - np.dot(link3, h) * h
+    rest = _angle_about(h, link2, link3)
+    long2, long3 = np.dot(link2, link2), np.dot(link3, link3)
+    for shoulder in range(2):
+        q1 = middle1 + (half1 if shoulder == 0 else -half1)
+        r1 = _rotation(a1, q1)
+        back = r1.T @ turn
+        # h·(R5 a6) = cos q5 h·a6 + sin q5 h·(a5 x a6), h normal to a5.
+        middle5, half5 = _two_angles(np.dot(h, a6), np.dot(h, np.cross(a5, a6)), np.dot(h, back @ a6))
+        if half5 < 0.0:
+            continue
+        seen = back.T @ h
+        origin = r1.T @ (shift - points[0]) + points[0]
+        for wrist_branch in range(2):
+            q5 = middle5 + (half5 if wrist_branch == 0 else -half5)
+            r5 = _rotation(a5, q5)
+            q6 = -_angle_about(a6, r5.T @ h, seen)
+            r56 = r5 @ _rotation(a6, q6)
+            planar = back @ r56.T
+            # e2 e3 e4 maps x to planar x + moved_origin.
+            offset = origin + back @ wrist - planar @ wrist
+            reach = planar @ points[3] + offset - points[1]
+            reach = reach - np.dot(reach, h) * h
+            total = _angle_about(h, side, planar @ side)
+            cosine = (np.dot(reach, reach) - long2 - long3) / (2.0 * math.sqrt(long2 * long3))
+            if abs(cosine) > 1.0 + 1e-9:
+                continue
+            bend = math.acos(min(max(cosine, -1.0), 1.0))
+            for elbow in range(2):
+                inner = bend if elbow == 0 else -bend
+                q3 = inner - rest
+                q2 = _angle_about(h, link2 + _rotation(h, q3) @ link3, reach)
+                label = 4 * shoulder + 2 * wrist_branch + elbow
+                q[label, 0], q[label, 1], q[label, 2] = q1, q2, sign3 * q3
+                q[label, 3], q[label, 4], q[label, 5] = sign4 * (total - q2 - q3), q5, q6
+                for i in range(6):
+                    q[label, i] = math.pi - (math.pi - q[label, i]) % (2.0 * math.pi)
+                found[label] = True

@@ -77,15 +77,15 @@ def _starts(count: int, level: int) -> Ints:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def segment_blocked(
+def blocking_triangle(
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, bounds: Floats, starts: Ints, triangles: Floats
-) -> bool:
-    """Tell whether a triangle meets the segment o + t d, 0 < t < 1.
+) -> int:
+    """Return the row of a triangle that meets the segment o + t d, 0 < t < 1 (any, not the nearest), or -1.
 
     Triangle test: T. Möller, B. Trumbore, "Fast, minimum storage ray/triangle intersection", 1997.
     """
     if len(triangles) == 0:
-        return False
+        return -1
     tiny = 1e-200
     ix = 1.0 / (dx if abs(dx) > tiny else tiny)
     iy = 1.0 / (dy if abs(dy) > tiny else tiny)
@@ -121,18 +121,18 @@ def segment_blocked(
                     continue
                 t = (bx * qx + by * qy + bz * qz) * inverse
                 if 0.0 < t < 1.0:
-                    return True
+                    return k
         while node & 1:
             node >>= 1
         node |= 1 if node else 0
-    return False
+    return -1
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _all_segments(origins: Floats, ends: Floats, bounds: Floats, starts: Ints, triangles: Floats) -> Bools:
     result = np.zeros(len(origins), np.bool_)
     for k in range(len(origins)):
-        result[k] = segment_blocked(
+        result[k] = 0 <= blocking_triangle(
             origins[k, 0], origins[k, 1], origins[k, 2],
             ends[k, 0] - origins[k, 0], ends[k, 1] - origins[k, 1], ends[k, 2] - origins[k, 2],
             bounds, starts, triangles,

@@ -21,7 +21,7 @@ from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.scene import CORNERS_PER_TAG, Scene, Targets
 from netdesign.model.task import VisibilityLimits
-from netdesign.photogrammetry.bvh import TriangleTree, segment_blocked
+from netdesign.photogrammetry.bvh import TriangleTree, blocking_triangle
 
 REASONS = ("seen", "behind", "incidence", "frame", "size", "depth of field", "occluded")
 SEEN, BEHIND, INCIDENCE, FRAME, SIZE, DEPTH_OF_FIELD, OCCLUDED = range(len(REASONS))
@@ -142,7 +142,7 @@ def tag_blocked(
         if height <= clearance:
             return True
         share = 1.0 - clearance / height
-        if segment_blocked(cx, cy, cz, dx * share, dy * share, dz * share, bounds, starts, triangles):
+        if blocking_triangle(cx, cy, cz, dx * share, dy * share, dz * share, bounds, starts, triangles) >= 0:
             return True
     return False
 

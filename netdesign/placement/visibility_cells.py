@@ -1,0 +1,262 @@
+"""Visibility over whole cells of the viewing sphere, decided with proof (kernels of ``visibility_map``).
+
+Every test of ``photogrammetry.visibility`` is made at the middle of a cell and then for the cell's worst viewpoint.
+With delta the largest angle between a viewing direction of the cell and its middle, w the distance of an object point
+from the sphere's centre and R the radius:
+
+* the camera moves by at most 2 R sin(delta / 2), a point's depth R - u·p changes by at most 2 w sin(delta / 2);
+* the camera turns by at most kappa·delta. kappa = 1 / cos(theta / 2) for the fixed roll of ``frames.look_at``, theta
+  the largest polar angle on the way: u turns by delta, and the frame spins about it by tan(theta / 2) times that;
+  kappa = 1 when the roll is free, because only roll-free measures are then used;
+* so a point moves in the camera frame by at most rho = 2 w sin(kappa·delta / 2), and its normalised image point q by at
+  most rho sqrt(1 + q²) / z, z its least depth; distortion stretches that by at most its largest gain;
+* an edge of length s changes in normalised coordinates by at most kappa·delta S s / z (1 + 2 w / z), S² = 1 + q²:
+  the derivatives of its two ends, subtracted before they are bounded.
+"""
+
+import numba
+import numpy as np
+
+from netdesign.model.arrays import Floats, Ints
+from netdesign.photogrammetry.bvh import blocking_triangle
+from netdesign.photogrammetry.occlusion import LARGEST_PATCH, cone_is_covered, cone_is_free
+
+HIDDEN, UNDECIDED, VISIBLE = 0, 1, 2
+
+
+@numba.njit(cache=True, error_model="numpy")
+def classify(
+    pose: Floats, radius: float, delta: float, turn: float, points: Floats, away: Floats, normal: Floats,
+    settings: Floats, field: Floats, tag_size: float,
+) -> int:  # fmt: skip
+    """Return HIDDEN, UNDECIDED or VISIBLE, but for occlusion, of one tag from every viewpoint of a cell.
+
+    Args:
+        pose: (4, 4) world_from_cam in the middle of the cell.  radius: R.  delta: rad.  turn: kappa·delta, rad.
+        points: (5, 3) of the tag.  away: (5,) their distances from the sphere's centre.  normal: (3,).
+        settings: of ``visibility.sight_settings``.  field: of ``visibility_map.field_bounds``.
+    """
+    moved = 2.0 * radius * np.sin(0.5 * delta)
+    sin_limit = np.sqrt(max(1.0 - settings[12] ** 2, 0.0))
+    everywhere = True
+    nearest, widest, farthest_out = np.inf, 0.0, 0.0
+    image = np.empty((4, 2))
+    for k in range(4):
+        dx, dy, dz = points[k, 0] - pose[0, 3], points[k, 1] - pose[1, 3], points[k, 2] - pose[2, 3]
+        z = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
+        depth_change = 2.0 * away[k] * np.sin(0.5 * delta)
+        if z + depth_change <= 0.0 or z + depth_change < settings[14] or z - depth_change > settings[15]:
+            return HIDDEN
+        if z - depth_change < settings[14] or z + depth_change > settings[15]:
+            everywhere = False
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        sine = moved / distance
+        if sine >= 1.0 or z - depth_change <= 0.0:
+            return UNDECIDED
+        cosine = np.sqrt(1.0 - sine * sine)
+        seen_at = -(dx * normal[0] + dy * normal[1] + dz * normal[2]) / distance
+        if seen_at < settings[12] * cosine - sin_limit * sine - 1e-12:
+            return HIDDEN
+        if sine >= sin_limit or seen_at < settings[12] * cosine + sin_limit * sine + 1e-12:
+            everywhere = False
+        nearest = min(nearest, z - depth_change)
+        image[k, 0] = (pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz) / z
+        image[k, 1] = (pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz) / z
+        widest = max(widest, image[k, 0] ** 2 + image[k, 1] ** 2)
+        farthest_out = max(farthest_out, away[k])
+    # The worst of the four corners stands for all of them.
+    stretch = np.sqrt(1.0 + widest)
+    shift = 2.0 * farthest_out * np.sin(0.5 * min(turn, np.pi)) * stretch / nearest
+    reach = field[1] + shift
+    square = reach * reach
+    tangential = abs(settings[6]) + abs(settings[7])
+    bend = 3.0 * abs(settings[4]) * square + 5.0 * abs(settings[5]) * square * square + 6.4 * tangential * reach
+    curve = 6.0 * abs(settings[4]) * reach + 20.0 * abs(settings[5]) * reach * square + 6.4 * tangential
+    focal_high, focal_low = max(settings[0], settings[1]), min(settings[0], settings[1])
+    stretch = np.sqrt(1.0 + (np.sqrt(widest) + shift) ** 2)
+    edge = stretch * tag_size / nearest
+    edge_change = turn * edge * (1.0 + 2.0 * farthest_out / nearest)
+    shortest_low, shortest_high = np.inf, np.inf
+    free_roll = field[2] > 0.0
+    margin = focal_high * (1.0 + bend) * shift + 1e-9
+    u = v = first_u = first_v = last_u = last_v = 0.0
+    for k in range(4):
+        x, y = image[k, 0], image[k, 1]
+        s = x * x + y * y
+        r = np.sqrt(s)
+        if r - shift > field[1]:
+            return HIDDEN
+        if free_roll:
+            if r + shift > field[0]:
+                everywhere = False
+            x0, y0 = image[k - 1, 0], image[k - 1, 1]
+            length = np.sqrt((x - x0) ** 2 + (y - y0) ** 2)
+            shortest_low = min(shortest_low, focal_low * max(1.0 - bend, 0.0) * (length - edge_change))
+            shortest_high = min(shortest_high, focal_high * (1.0 + bend) * (length + edge_change))
+            continue
+        if s > settings[17]:
+            return UNDECIDED
+        radial = 1.0 + s * (settings[4] + s * settings[5])
+        p1, p2 = settings[6], settings[7]
+        u = settings[0] * (x * radial + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)) + settings[2]
+        v = settings[1] * (y * radial + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y) + settings[3]
+        low, high = min(u - settings[8], v - settings[10]), max(u - settings[9], v - settings[11])
+        if low < -margin or high > margin:
+            return HIDDEN
+        if low < margin or high > -margin or (r + shift) ** 2 > settings[17]:
+            everywhere = False
+        change = focal_high * ((1.0 + bend) * edge_change + curve * edge * turn * stretch * farthest_out / nearest)
+        if k == 0:
+            first_u, first_v = u, v
+        else:
+            length = np.sqrt((u - last_u) ** 2 + (v - last_v) ** 2)
+            shortest_low, shortest_high = min(shortest_low, length - change), min(shortest_high, length + change)
+        if k == 3:
+            length = np.sqrt((u - first_u) ** 2 + (v - first_v) ** 2)
+            shortest_low, shortest_high = min(shortest_low, length - change), min(shortest_high, length + change)
+        last_u, last_v = u, v
+    if shortest_high < settings[13] - 1e-9:
+        return HIDDEN
+    if shortest_low < settings[13] + 1e-9:
+        everywhere = False
+    return VISIBLE if everywhere else UNDECIDED
+
+
+@numba.njit(cache=True, error_model="numpy")
+def shadow(
+    state: int, pose: Floats, spread: float, points: Floats, normal: Floats, settings: Floats, bounds: Floats,
+    starts: Ints, triangles: Floats, across: Ints, visited: Ints, queue: Ints,
+) -> int:  # fmt: skip
+    """Return ``state`` of a tag and a cell after occlusion for camera positions within ``spread`` of the pose."""
+    axis = np.empty(3)
+    for trial in range(2):
+        for k in range(4, -1, -1):
+            dx, dy, dz = pose[0, 3] - points[k, 0], pose[1, 3] - points[k, 1], pose[2, 3] - points[k, 2]
+            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            height = dx * normal[0] + dy * normal[1] + dz * normal[2]
+            if height <= settings[16] or distance <= spread:
+                return UNDECIDED
+            axis[0], axis[1], axis[2] = dx / distance, dy / distance, dz / distance
+            x, y, z = points[k, 0], points[k, 1], points[k, 2]
+            if trial == 0:
+                share = settings[16] / height
+                hit = blocking_triangle(
+                    x + share * dx, y + share * dy, z + share * dz, (1.0 - share) * dx, (1.0 - share) * dy,
+                    (1.0 - share) * dz, bounds, starts, triangles,
+                )  # fmt: skip
+                if hit >= 0:
+                    if cone_is_covered(
+                        hit, x, y, z, axis, distance, spread, normal, settings[16], settings[12], triangles, across,
+                        visited, queue,
+                    ):  # fmt: skip
+                        return HIDDEN
+                    state = UNDECIDED
+            elif not cone_is_free(x, y, z, axis, distance, spread, normal, settings[16], bounds, starts, triangles):
+                return UNDECIDED
+        if state != VISIBLE:
+            break
+    return state
+
+
+@numba.njit(cache=True, error_model="numpy")
+def pose_on_sphere(alpha: float, beta: float, roll: float, centre: Floats, radius: float, pose: Floats) -> None:
+    """Write into ``pose`` (4, 4) what ``ViewingSphere.cameras`` gives for one viewpoint."""
+    ux, uy, uz = np.cos(beta) * np.cos(alpha), np.cos(beta) * np.sin(alpha), np.sin(beta)
+    scale = 1.0 / max(1.0 + uz, 1e-12)
+    cos, sin = np.cos(roll), np.sin(roll)
+    x = (1.0 - ux * ux * scale, -ux * uy * scale, -ux)
+    y = (ux * uy * scale, uy * uy * scale - 1.0, uy)
+    u = (ux, uy, uz)
+    for j in range(3):
+        pose[j, 0] = cos * x[j] + sin * y[j]
+        pose[j, 1] = cos * y[j] - sin * x[j]
+        pose[j, 2] = -u[j]
+        pose[j, 3] = centre[j] + radius * u[j]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def spread_angle(beta: float, half_alpha: float, half_beta: float) -> float:
+    """Return the largest angle between a direction in a cell and its middle, at elevation ``beta`` (haversine)."""
+    low, high = beta - half_beta, beta + half_beta
+    widest = 1.0 if low < 0.0 < high else max(np.cos(low), np.cos(high))
+    square = np.sin(0.5 * half_beta) ** 2 + np.cos(beta) * widest * np.sin(0.5 * min(half_alpha, np.pi)) ** 2
+    return float(2.0 * np.arcsin(min(np.sqrt(square), 1.0)))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def fill(
+    grid: Floats, block: int, roll: float, free_roll: bool, centre: Floats, radius: float, points: Floats, away: Floats,
+    normals: Floats, shadowed: Floats, settings: Floats, field: Floats, tag_size: float, bounds: Floats, starts: Ints,
+    triangles: Floats, across: Ints, sure: Floats, maybe: Floats,
+) -> None:  # fmt: skip
+    """Set the bits of ``sure`` and ``maybe`` (cells, words): quadtree over blocks of cells, undecided tags go down.
+
+    Args:
+        grid: of VisibilityMap.  block: cells along the edge of a block of the coarsest level, a power of two.
+        shadowed: (g,) whether any part of the mesh rises above the tag's plane.
+        Others: as in ``classify`` and ``occlusion``.
+    """
+    columns, rows = int(grid[2]), int(grid[5])
+    tags = len(points)
+    depth = 4 * (int(np.log2(block)) + 1)
+    stack = np.empty((depth, 3), np.int64)
+    waiting = np.empty((depth, tags), np.int64)
+    count = np.zeros(depth, np.int64)
+    pose = np.zeros((4, 4))
+    left = np.empty(tags, np.int64)
+    visited, queue = np.zeros(len(triangles) + 1, np.int64), np.empty(LARGEST_PATCH, np.int64)
+    for top_row in range(0, rows, block):
+        for top_column in range(0, columns, block):
+            stack[0, 0], stack[0, 1], stack[0, 2] = top_row, top_column, block
+            count[0] = tags
+            for g in range(tags):
+                waiting[0, g] = g
+            top = 1
+            while top > 0:
+                top -= 1
+                row, column, size = stack[top, 0], stack[top, 1], stack[top, 2]
+                row_end, column_end = min(row + size, rows), min(column + size, columns)
+                beta = grid[3] + 0.5 * (row + row_end) / grid[4]
+                alpha = grid[0] + 0.5 * (column + column_end) / grid[1]
+                delta = spread_angle(beta, 0.5 * (column_end - column) / grid[1], 0.5 * (row_end - row) / grid[4])
+                delta += 1e-12
+                polar = 0.5 * np.pi - beta + delta
+                turn = delta if free_roll else delta / max(np.cos(0.5 * min(polar, np.pi)), 1e-9)
+                pose_on_sphere(alpha, beta, roll, centre, radius, pose)
+                spread = 2.0 * radius * np.sin(0.5 * delta)
+                remaining = 0
+                for index in range(count[top]):
+                    g = waiting[top, index]
+                    state = classify(
+                        pose, radius, delta, turn, points[g], away[g], normals[g], settings, field, tag_size
+                    )
+                    if shadowed[g] != 0.0 and (state == VISIBLE or (state == UNDECIDED and size == 1)):
+                        state = shadow(
+                            state, pose, spread, points[g], normals[g], settings, bounds, starts, triangles, across,
+                            visited, queue,
+                        )  # fmt: skip
+                    if state == HIDDEN:
+                        continue
+                    if state == UNDECIDED and size > 1:
+                        left[remaining] = g
+                        remaining += 1
+                        continue
+                    bit = np.uint64(1) << np.uint64(g & 63)
+                    for i in range(row, row_end):
+                        for j in range(column, column_end):
+                            if state == VISIBLE:
+                                sure[i * columns + j, g >> 6] |= bit
+                            else:
+                                maybe[i * columns + j, g >> 6] |= bit
+                if remaining == 0:
+                    continue
+                half = size // 2
+                for quarter in range(4):
+                    next_row, next_column = row + half * (quarter >> 1), column + half * (quarter & 1)
+                    if next_row >= rows or next_column >= columns:
+                        continue
+                    stack[top, 0], stack[top, 1], stack[top, 2] = next_row, next_column, half
+                    count[top] = remaining
+                    for index in range(remaining):
+                        waiting[top, index] = left[index]
+                    top += 1

@@ -98,6 +98,8 @@ def tie_flags(visible: Bools, image_names: Sequence[str]) -> tuple[str, ...]:
 
     Points seen in two images carry no scale from one block to the next, so they do not count as ties.
     """
+    if len(visible) < 3:
+        return ()
     strong = visible[:, visible.sum(axis=0) >= 3].astype(np.int64)
     common = strong @ strong.T
     _, label = connected_components(common >= MIN_COMMON_POINTS, directed=False)

@@ -1,0 +1,176 @@
+"""What an adjustment cannot determine, and what its user should know, in words."""
+
+import numpy as np
+from scipy.stats import chi2
+
+from netdesign.adjustment.problem import BundleProblem
+from netdesign.model.adjustment import Adjustment
+from netdesign.model.arrays import Floats
+from netdesign.photogrammetry.connectivity import listed, named, tie_flags
+from netdesign.photogrammetry.normals import Reduced
+from netdesign.photogrammetry.observation_equations import Layout
+
+POINT_CONDITION = 1e-9  # of a point's normals: below it its rays are parallel
+DEPTH_PRECISION = 0.05  # sigma over distance above which a point counts as not determined
+CORRELATION = 0.95
+NOT_DETERMINED = 100.0  # effect of a parameter's sigma in the image, in sigmas of one image coordinate
+ROLL_ALIKE = 0.97  # mean resultant length of the roll angles above which all images are rolled alike
+
+
+def point_complaints(problem: BundleProblem, layout: Layout, reduced: Reduced) -> tuple[str, ...]:
+    """Return the points whose rays are parallel, or so nearly parallel that the distance is noise.
+
+    Two images at one position and nothing else is the common cause.
+    """
+    observations = problem.observations
+    ray = problem.points[observations.point] - problem.world_from_cam[observations.image, :3, 3]
+    distance = np.full(len(problem.points), np.inf)
+    np.minimum.at(distance, observations.point, np.linalg.norm(ray, axis=1))
+    spread = np.sqrt(np.linalg.eigvalsh(reduced.inverse)[:, -1])
+    bad = layout.eliminated & ((reduced.point_condition < POINT_CONDITION) | (spread > DEPTH_PRECISION * distance))
+    if not bad.any():
+        return ()
+    images = np.unique(observations.image[bad[observations.point]])
+    return (
+        f"{int(bad.sum())} point(s) have (nearly) parallel rays, their distance is not determined: "
+        f"{listed(named(problem.point_names, bad))}; they are seen by images "
+        f"{listed(named(problem.image_names, images))} only, from (nearly) one position",
+    )
+
+
+def rolls_alike(poses: Floats) -> bool:
+    """Tell whether all images (n, 4, 4) have about the same roll, after the smallest rotation to their mean axis."""
+    axes = poses[:, :3, 2]
+    mean = axes.sum(axis=0)
+    length = float(np.linalg.norm(mean))
+    if length < 0.1 * len(axes):
+        return False
+    mean = mean / length
+    # Carry each x axis along the smallest rotation that takes its viewing direction to the mean one.
+    x_axes = poses[:, :3, 0]
+    half = axes + mean
+    weight = 1.0 + axes @ mean
+    carried = x_axes - (np.einsum("ni,ni->n", x_axes, half) / weight)[:, None] * half
+    carried += 2.0 * np.einsum("ni,ni->n", x_axes, axes)[:, None] * mean
+    reference = carried[0]
+    angle = np.arctan2(np.cross(reference, carried) @ mean, carried @ reference)
+    return bool(abs(np.exp(1j * angle).mean()) > ROLL_ALIKE)
+
+
+def _is_flat(points: Floats) -> bool:
+    singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(singular[2] < 0.02 * singular[0])
+
+
+def _advice(problem: BundleProblem) -> str:
+    cures = []
+    if rolls_alike(problem.world_from_cam):
+        cures.append("take some images with the camera rolled by 90°")
+    if _is_flat(problem.points[np.unique(problem.observations.point)]):
+        cures.append("the object is flat: add targets in depth or strongly convergent images")
+    return "; advice: " + ", ".join(cures or ["hold the parameter or add images"])
+
+
+def parameter_effect(problem: BundleProblem, sigma: Floats) -> Floats:
+    """Return the effect (p,) px of one sigma of each free parameter at the edge of the image points' field.
+
+    Args:
+        sigma: (p,) in the parameters' own units, camera by camera.
+    """
+    observations = problem.observations
+    camera = problem.camera_of_image[observations.image]
+    effects: list[float] = []
+    for index, intrinsics in enumerate(problem.intrinsics):
+        focal = float(np.sqrt(intrinsics[0] * intrinsics[1]))
+        rows = camera == index
+        offset = (observations.xy_px[rows] - intrinsics[2:4]) / focal
+        radius = float(np.sqrt((offset**2).sum(axis=1).max(initial=0.0)))
+        by_name = {
+            "f": radius, "fx": radius, "fy": radius, "cx": 1.0, "cy": 1.0, "k1": focal * radius**3,
+            "k2": focal * radius**5, "p1": 3 * focal * radius**2, "p2": 3 * focal * radius**2,
+        }  # fmt: skip
+        effects.extend(by_name[name] for name in problem.refine)
+    return np.array(effects) * sigma
+
+
+def calibration_complaints(
+    problem: BundleProblem, parameter_names: tuple[str, ...], covariance: Floats | None
+) -> tuple[str, ...]:
+    """Return the interior parameters that the network does not determine, with a cure.
+
+    Args:
+        covariance: (p, p) a priori; None when the normal equations are singular: the advice alone comes back then.
+    """
+    if not parameter_names:
+        return ()
+    if covariance is None:
+        return (_advice(problem)[2:],)
+    effect = parameter_effect(problem, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+    noise = float(np.sqrt(np.median(problem.observations.covariance[:, [0, 1], [0, 1]])))
+    bad = effect > NOT_DETERMINED * noise
+    if not bad.any():
+        return ()
+    found = [
+        f"{name} (sigma {value:.3g} px at the edge of the field)"
+        for name, value in zip(named(parameter_names, bad), effect[bad].tolist(), strict=True)
+    ]
+    return (f"interior parameters that this network does not determine: {listed(found)}{_advice(problem)}",)
+
+
+def quality_warnings(problem: BundleProblem, adjustment: Adjustment, dropped: tuple[int, ...]) -> tuple[str, ...]:
+    """Return what the reader of an adjustment must know besides its numbers."""
+    warnings = []
+    names = problem.point_names
+    if dropped:
+        lost = [names[j] for j in dropped]
+        warnings.append(
+            f"{len(lost)} point(s) lost their rays to the outlier test and have no estimate: {listed(lost)}"
+        )
+    rays = adjustment.rays
+    few = (rays > 0) & (rays < 3) & ~problem.known()
+    if few.any():
+        warnings.append(
+            f"{int(few.sum())} point(s) are uncontrolled, fewer than 3 rays (errors along the epipolar line "
+            f"cannot be found): {listed(named(names, few))}"
+        )
+    unseen = (rays == 0) & ~problem.known()
+    unseen[list(dropped)] = False
+    if unseen.any():
+        warnings.append(
+            f"{int(unseen.sum())} point(s) are in no image and have no estimate: {listed(named(names, unseen))}"
+        )
+    low = adjustment.redundancy_numbers.min(axis=1) < 0.1
+    if low.any():
+        warnings.append(f"{int(low.sum())} image point(s) have a redundancy number below 0.1: hardly checked")
+    warnings.extend(tie_flags(problem.visible(), problem.image_names) if not problem.known().any() else ())
+    warnings.extend(_variance_warning(adjustment))
+    warnings.extend(_correlations(problem, adjustment))
+    return tuple(warnings)
+
+
+def _variance_warning(adjustment: Adjustment) -> tuple[str, ...]:
+    if adjustment.redundancy <= 0:
+        return ("redundancy is 0: nothing checks the image points, sigma0 is undefined",)
+    low, high = np.sqrt(chi2.ppf([0.0005, 0.9995], adjustment.redundancy) / adjustment.redundancy)
+    if low <= adjustment.sigma0 <= high:
+        return ()
+    return (
+        f"sigma0 {adjustment.sigma0:.3f} lies outside [{low:.3f}, {high:.3f}] (99.9 %): the a-priori sigma of the "
+        "image points is not theirs, or something is not modelled",
+    )
+
+
+def _correlations(problem: BundleProblem, adjustment: Adjustment) -> tuple[str, ...]:
+    sigma = np.sqrt(np.diag(adjustment.parameter_covariance))
+    correlation = adjustment.parameter_covariance / np.outer(sigma, sigma)
+    first, second = np.nonzero(np.triu(np.abs(correlation) > CORRELATION, 1))
+    names = adjustment.parameter_names
+    pairs = [
+        f"{names[a]}-{names[b]} {correlation[a, b]:+.3f}" for a, b in zip(first.tolist(), second.tolist(), strict=True)
+    ]
+    if not pairs:
+        return ()
+    advice = ""
+    if rolls_alike(problem.world_from_cam) and any("c" in pair for pair in pairs):
+        advice = "; images rolled by 90° would separate them"
+    return (f"interior parameters correlated above {CORRELATION}: {listed(pairs)}{advice}",)

@@ -95,9 +95,9 @@ def _three_opt_move(D: Floats, t: Ints, P: Floats, threshold: float) -> bool:
         for y in range(N):
             P[x, y] = D[t[x], t[y]]
         P[x, N] = P[x, 0]
-    row_legs = np.uint64(N)
+    legs = np.empty(N)
     for x in range(N):
-        P[N, x] = P[x, x + 1]
+        legs[x] = P[x, x + 1]
     one = np.uint64(1)  # unsigned indices: a signed one is tested for < 0, which keeps the loop scalar
     for i in range(N - 2):
         for j in range(i + 1, N - 1):
@@ -107,7 +107,7 @@ def _three_opt_move(D: Floats, t: Ints, P: Floats, threshold: float) -> bool:
             hits = 0  # counting vectorises, taking a minimum does not
             for x in range(N - 1 - j):
                 k = np.uint64(x) + row_j1
-                leg = P[row_legs, k]
+                leg = legs[k]
                 hits += int(
                     (across + P[row_i1, k] + P[row_j1, k + one] < leg)
                     | (back + P[row_i1, k] + P[row_j, k + one] < leg)
@@ -171,7 +171,7 @@ def nearest_neighbour_3opt(distance: Floats) -> tuple[Ints, float]:
     """
     D = _with_dummy(distance)
     t = _nearest_neighbour(D, 1) if len(D) > 1 else np.arange(len(D))
-    length = _improve(D, t, np.empty((len(D) + 1, len(D) + 1)))
+    length = _improve(D, t, np.empty((len(D), len(D) + 1)))
     return _without_dummy(t), length
 
 
@@ -188,7 +188,7 @@ def path_length(positions: Floats) -> float:
             D[a + 1, b + 1] = D[b + 1, a + 1] = np.sqrt(square)
     if n < 2:
         return 0.0
-    length: float = _improve(D, _nearest_neighbour(D, 1), np.empty((n + 2, n + 2)))
+    length: float = _improve(D, _nearest_neighbour(D, 1), np.empty((n + 1, n + 2)))
     return length
 
 
@@ -241,7 +241,7 @@ def iterated_local_search(distance: Floats, cuts: Ints) -> tuple[Ints, float]:
     """
     D = _with_dummy(distance)
     N = len(D)
-    P = np.empty((N + 1, N + 1))
+    P = np.empty((N, N + 1))
     best = np.arange(N)
     best_length = _improve(D, best, P)
     for first in range(1, N):

@@ -59,7 +59,7 @@ def homography(corners: Floats) -> tuple[Floats, Floats]:
     for index, ((u, v), (x, y)) in enumerate(zip(SQUARE, corners, strict=True)):
         design[2 * index] = (u, v, 1, 0, 0, 0, -u * x, -v * x)
         design[2 * index + 1] = (0, 0, 0, u, v, 1, -u * y, -v * y)
-    inverse: Floats = np.linalg.inv(design)
+    inverse: Floats = np.asarray(np.linalg.inv(design), np.float64)
     h: Floats = inverse @ right
     scale = SQUARE @ h[6:] + 1.0
     return np.append(h, 1.0).reshape(3, 3), np.asarray(inverse * np.repeat(scale, 2))

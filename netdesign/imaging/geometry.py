@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from netdesign.imaging.looks import Appearance
 from netdesign.imaging.tags import CELLS, QUIET_CELLS
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.camera import Camera
@@ -148,3 +149,12 @@ def part_triangles(triangles: Floats, camera: Camera, world_from_cam: Floats, ne
     bent = np.zeros_like(in_camera)
     bent[usable] = distorted_vertices(in_camera[usable], camera.distortion) * (1 + RECESS)
     return bent, usable
+
+
+def face_levels(part: Part, look: Appearance) -> Floats:
+    """Return the (t,) light levels of the part's faces: Lambert's law, softened."""
+    a, b, c = np.moveaxis(part.triangles, 1, 0)
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    light = np.asarray(look.light) / np.linalg.norm(look.light)
+    return np.asarray(look.face - look.relief * 0.5 * (1 - normals @ light))

@@ -5,6 +5,7 @@ this file, so that agreement between the two means something.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -35,7 +36,7 @@ def margin_px(blur_px: float) -> int:
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
 def _decimate(
-    fine: NDArray[np.uint8], taps: NDArray[np.float32], supersample: int, first_row: int, out: Picture
+    fine: NDArray[Any], taps: NDArray[np.float32], supersample: int, first_row: int, scale: float, out: Picture
 ) -> None:
     rows, columns = out.shape
     fine_rows, fine_columns = fine.shape
@@ -58,14 +59,14 @@ def _decimate(
             else:
                 for tap in range(len(taps)):
                     total += taps[tap] * column_sum[min(max(start_column + tap, 0), fine_columns - 1)]
-            out[row, column] = total / np.float32(255)
+            out[row, column] = total * np.float32(scale)
 
 
-def decimate(fine: NDArray[np.uint8], blur_px: float, supersample: int, first_row: int, rows: int) -> Picture:
+def decimate(fine: NDArray[Any], blur_px: float, supersample: int, first_row: int, rows: int) -> Picture:
     """Blur, integrate over pixels and decimate in one separable filter.
 
     Args:
-        fine: (r·S, w·S) supersampled grey levels, 255 = full scale.
+        fine: (r·S, w·S) supersampled light: uint8 with full scale 255, or float32 with full scale 1.
         first_row, rows: the pixel rows wanted, counted from the first row of ``fine``; what the filter sees beyond
             the border is the border's own value.
 
@@ -73,7 +74,8 @@ def decimate(fine: NDArray[np.uint8], blur_px: float, supersample: int, first_ro
         (rows, w) linear light, full scale 1.
     """
     out = np.empty((rows, fine.shape[1] // supersample), np.float32)
-    _decimate(fine, pixel_kernel(blur_px, supersample), supersample, first_row, out)
+    scale = 1 / 255 if fine.dtype == np.uint8 else 1.0
+    _decimate(fine, pixel_kernel(blur_px, supersample), supersample, first_row, scale, out)
     return out
 
 

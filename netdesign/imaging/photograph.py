@@ -6,8 +6,10 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from netdesign.imaging.looks import Appearance
 from netdesign.imaging.optics import Picture, Shading, expose, noise_generator
-from netdesign.imaging.render import Appearance, Renderer
+from netdesign.imaging.reference import ReferenceRenderer
+from netdesign.imaging.render import Renderer
 from netdesign.model.arrays import Floats
 from netdesign.model.camera import Camera
 from netdesign.model.scene import Scene
@@ -45,7 +47,11 @@ class Photographer:
 
     def __init__(self, scene: Scene, camera: Camera, shoot: Shoot) -> None:
         self.camera, self.shoot = camera, shoot
-        self._renderer: LightSource = Renderer(scene, camera, shoot.supersample, shoot.appearance)
+        self._renderer: LightSource = (
+            Renderer(scene, camera, shoot.supersample, shoot.appearance)
+            if shoot.renderer == "pyrender"
+            else ReferenceRenderer(scene, camera, shoot.appearance)
+        )
         self._shading = None if shoot.shading == Shading() else shoot.shading.factor(camera)
 
     def take(self, index: int, world_from_cam: Floats) -> NDArray[np.generic]:

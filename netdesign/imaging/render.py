@@ -13,7 +13,6 @@ OpenGL's y points up and z backwards, hence the sign change of both in ``_gl``.
 
 import os
 import warnings
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -21,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netdesign.errors import EnvironmentProblem
-from netdesign.imaging.geometry import FACE_STEP_PX, TagQuad, divided, part_triangles, tag_quads
+from netdesign.imaging.geometry import FACE_STEP_PX, TagQuad, divided, face_levels, part_triangles, tag_quads
+from netdesign.imaging.looks import Appearance
 from netdesign.imaging.optics import Picture, decimate, margin_px
 from netdesign.imaging.tags import texture
 from netdesign.model.arrays import Floats, Ints
@@ -32,24 +32,6 @@ PACKAGES = "libegl1 libgl1"  # Debian and Ubuntu; they pull Mesa's software rast
 MAX_SIDE = 16384  # of a render target
 BAND_SAMPLES = 2**25  # supersamples of one band: 270 MB of colour and depth
 SUPERSAMPLES_PER_TEXEL = 1.5
-
-
-@dataclass(frozen=True, kw_only=True)
-class Appearance:
-    """Linear light levels of the picture, full scale 1.
-
-    Attributes:
-        black, white: of a tag and its quiet zone.
-        face: of a part's face that looks at the light, darker by up to ``relief`` when it looks away: only for the eye.
-        light: (3,) direction to that light, world frame.
-    """
-
-    black: float = 20 / 255
-    white: float = 235 / 255
-    face: float = 0.72
-    relief: float = 0.22
-    background: float = 0.25
-    light: tuple[float, float, float] = (0.45, 0.25, 0.86)
 
 
 def probe() -> str:
@@ -71,7 +53,7 @@ class Renderer:
         self.appearance = appearance or Appearance()
         self._textures: dict[tuple[int, int], Any] = {}
         self._divided: dict[float, tuple[Floats, Ints]] = {}
-        self._face_level = _face_levels(scene, self.appearance)
+        self._face_level = face_levels(scene.part, self.appearance)
 
     def render(self, world_from_cam: Floats) -> Picture:
         """Return the (h, w) light on the sensor, full scale 1, blurred by the optics and integrated over pixels.
@@ -139,15 +121,6 @@ class Renderer:
             image = texture(targets.family, int(targets.ids[quad.tag]), texels, look.black, look.white)
             self._textures[key] = _pyrender().Texture(source=image, source_channels="R")
         return self._textures[key]
-
-
-def _face_levels(scene: Scene, look: Appearance) -> Floats:
-    """Return the (t,) light levels of the part's faces."""
-    a, b, c = np.moveaxis(scene.part.triangles, 1, 0)
-    normals = np.cross(b - a, c - a)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    light = np.asarray(look.light) / np.linalg.norm(look.light)
-    return np.asarray(look.face - look.relief * 0.5 * (1 - normals @ light))
 
 
 def _gl(vertices: Floats) -> NDArray[np.float32]:
@@ -227,7 +200,7 @@ def _context() -> Any:
     from OpenGL import GL as gl
     from pyrender.renderer import Renderer as Stock
 
-    class Slim(Stock):  # type: ignore[misc]
+    class Slim(Stock):
         """pyrender's renderer with a plain framebuffer: no multisampling, red channel only."""
 
         gl: Any = None

@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from netdesign.model.frames import look_at, sphere_directions
+from netdesign.adjustment.problem import BundleProblem
+from netdesign.model.camera import Camera
+from netdesign.model.frames import exp_rotation, look_at, sphere_directions
 from netdesign.model.network import Observations
 from netdesign.photogrammetry.collinearity import project, project_with_jacobians
 
@@ -76,3 +78,37 @@ def bordered_covariance(design, borders):
 def relative(a, b):
     """Relative Frobenius distance of b from a."""
     return np.linalg.norm(a - b) / np.linalg.norm(b)
+
+
+def camera_of(intrinsics=INTRINSICS):
+    """The Camera with the given intrinsics (8,)."""
+    return Camera(
+        width_px=2448,
+        height_px=2048,
+        focal_px=intrinsics[:2],
+        principal_point_px=intrinsics[2:4],
+        distortion=intrinsics[4:],
+    )
+
+
+def disturbed(poses, points, seed=0, position=0.003, rotation=0.003, point=0.001):
+    """Approximate values: poses and points with Gaussian errors (m, rad)."""
+    rng = np.random.default_rng(seed)
+    start = poses.copy()
+    start[:, :3, 3] += position * rng.standard_normal((len(poses), 3))
+    start[:, :3, :3] = start[:, :3, :3] @ exp_rotation(rotation * rng.standard_normal((len(poses), 3)))
+    return start, points + point * rng.standard_normal(points.shape)
+
+
+def problem_of(observations, poses, points, intrinsics=INTRINSICS, **options):
+    """A BundleProblem of one camera with names i0, i1, … and p0, p1, …"""
+    return BundleProblem(
+        observations=observations,
+        camera_of_image=np.zeros(len(poses), dtype=np.int64),
+        intrinsics=np.atleast_2d(intrinsics),
+        world_from_cam=poses,
+        points=points,
+        image_names=[f"i{i}" for i in range(len(poses))],
+        point_names=[f"p{j}" for j in range(len(points))],
+        **options,
+    )

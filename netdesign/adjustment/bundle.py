@@ -82,14 +82,15 @@ def adjust(
     if remaining > CONVERGED:
         raise InfeasibleError(
             f"GTSAM's adjustment does not converge ({iterations} iterations; the minimum is still {remaining:.1e} "
-            "standard deviations away): approximate values too far off, gross errors, or a network that does not hold together"
+            "standard deviations away): approximate values too far off, gross errors, or a network that does not hold "
+            "together"
         )
     solution = anchored(solution_at(solved, iterations), scaled.points)
     adjustment = appraise(solution, unit, centre, False, (), ())
     joint = _joint(solution.problem, adjustment.used) * unit**2
     covariance = np.full_like(adjustment.point_covariance, np.inf)
     covariance[adjustment.used] = blocks(joint)[adjustment.used]
-    difference = np.linalg.norm((covariance - adjustment.point_covariance)[adjustment.used])
+    difference = np.linalg.norm(covariance[adjustment.used] - adjustment.point_covariance[adjustment.used])
     if not difference <= AGREEMENT * np.linalg.norm(adjustment.point_covariance[adjustment.used]):
         raise InfeasibleError(
             "the joint marginals of GTSAM and the reduced normal equations disagree: the network is close to singular "

@@ -11,9 +11,12 @@ from netdesign.photogrammetry.normals import Reduced
 from netdesign.photogrammetry.observation_equations import Layout
 
 POINT_CONDITION = 1e-9  # of a point's normals: below it its rays are parallel
-DEPTH_PRECISION = 0.05  # sigma over distance above which a point counts as not determined
+HOPELESS_DEPTH = 0.2  # sigma over distance above which a point counts as not determined
+WEAK_DEPTH = 0.01  # sigma over distance above which its ray geometry is named; many such points are a broken network
+WEAK_SHARE = 0.1
 CORRELATION = 0.95
-NOT_DETERMINED = 100.0  # effect of a parameter's sigma in the image, in sigmas of one image coordinate
+NOT_DETERMINED = 200.0  # effect of a parameter's sigma in the image, in sigmas of one image coordinate
+NOT_DETERMINED_FLAT = 10.0  # the same for a flat object seen without roll, where tilt stands in for the parameter
 ROLL_ALIKE = 0.97  # mean resultant length of the roll angles above which all images are rolled alike
 
 
@@ -22,15 +25,14 @@ def point_complaints(problem: BundleProblem, layout: Layout, reduced: Reduced) -
 
     Two images at one position and nothing else is the common cause.
     """
-    observations = problem.observations
-    ray = problem.points[observations.point] - problem.world_from_cam[observations.image, :3, 3]
-    distance = np.full(len(problem.points), np.inf)
-    np.minimum.at(distance, observations.point, np.linalg.norm(ray, axis=1))
-    spread = np.sqrt(np.linalg.eigvalsh(reduced.inverse)[:, -1])
-    bad = layout.eliminated & ((reduced.point_condition < POINT_CONDITION) | (spread > DEPTH_PRECISION * distance))
+    weakness = depth_weakness(problem, layout, reduced)
+    bad = layout.eliminated & ((reduced.point_condition < POINT_CONDITION) | (weakness > HOPELESS_DEPTH))
+    weak = weakness > WEAK_DEPTH
+    if weak.sum() > WEAK_SHARE * layout.eliminated.sum():
+        bad |= weak
     if not bad.any():
         return ()
-    images = np.unique(observations.image[bad[observations.point]])
+    images = np.unique(problem.observations.image[bad[problem.observations.point]])
     return (
         f"{int(bad.sum())} point(s) have (nearly) parallel rays, their distance is not determined: "
         f"{listed(named(problem.point_names, bad))}; they are seen by images "
@@ -38,23 +40,34 @@ def point_complaints(problem: BundleProblem, layout: Layout, reduced: Reduced) -
     )
 
 
+def depth_weakness(problem: BundleProblem, layout: Layout, reduced: Reduced) -> Floats:
+    """Return (m,): largest limited sigma of each point over its distance to the nearest image that sees it."""
+    observations = problem.observations
+    ray = problem.points[observations.point] - problem.world_from_cam[observations.image, :3, 3]
+    distance = np.full(len(problem.points), np.inf)
+    np.minimum.at(distance, observations.point, np.linalg.norm(ray, axis=1))
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(reduced.inverse)[:, -1], 0.0))
+    return np.where(layout.eliminated, spread / distance, 0.0)
+
+
 def rolls_alike(poses: Floats) -> bool:
-    """Tell whether all images (n, 4, 4) have about the same roll, after the smallest rotation to their mean axis."""
+    """Tell whether all images (n, 4, 4) are rolled alike.
+
+    Two ways to be alike: the smallest rotation to the mean viewing direction leaves the same x axis everywhere, or
+    the mean direction stands at the same angle in every image (cameras held upright around the object).
+    """
     axes = poses[:, :3, 2]
     mean = axes.sum(axis=0)
     length = float(np.linalg.norm(mean))
     if length < 0.1 * len(axes):
         return False
     mean = mean / length
-    # Carry each x axis along the smallest rotation that takes its viewing direction to the mean one.
     x_axes = poses[:, :3, 0]
     half = axes + mean
-    weight = 1.0 + axes @ mean
-    carried = x_axes - (np.einsum("ni,ni->n", x_axes, half) / weight)[:, None] * half
-    carried += 2.0 * np.einsum("ni,ni->n", x_axes, axes)[:, None] * mean
-    reference = carried[0]
-    angle = np.arctan2(np.cross(reference, carried) @ mean, carried @ reference)
-    return bool(abs(np.exp(1j * angle).mean()) > ROLL_ALIKE)
+    carried = x_axes - (np.einsum("ni,ni->n", x_axes, half) / (1.0 + axes @ mean))[:, None] * half
+    angle = np.arctan2(np.cross(carried[0], carried) @ mean, carried @ carried[0])
+    upright = np.arctan2(poses[:, :3, 1] @ mean, x_axes @ mean)
+    return bool(max(abs(np.exp(1j * angle).mean()), abs(np.exp(1j * upright).mean())) > ROLL_ALIKE)
 
 
 def _is_flat(points: Floats) -> bool:
@@ -107,7 +120,8 @@ def calibration_complaints(
         return (_advice(problem)[2:],)
     effect = parameter_effect(problem, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     noise = float(np.sqrt(np.median(problem.observations.covariance[:, [0, 1], [0, 1]])))
-    bad = effect > NOT_DETERMINED * noise
+    flat = _is_flat(problem.points[np.unique(problem.observations.point)]) and rolls_alike(problem.world_from_cam)
+    bad = effect > (NOT_DETERMINED_FLAT if flat and {"cx", "cy"} & set(problem.refine) else NOT_DETERMINED) * noise
     if not bad.any():
         return ()
     found = [
@@ -117,8 +131,14 @@ def calibration_complaints(
     return (f"interior parameters that this network does not determine: {listed(found)}{_advice(problem)}",)
 
 
-def quality_warnings(problem: BundleProblem, adjustment: Adjustment, dropped: tuple[int, ...]) -> tuple[str, ...]:
-    """Return what the reader of an adjustment must know besides its numbers."""
+def quality_warnings(
+    problem: BundleProblem, adjustment: Adjustment, dropped: tuple[int, ...], weakness: Floats
+) -> tuple[str, ...]:
+    """Return what the reader of an adjustment must know besides its numbers.
+
+    Args:
+        dropped: points without an estimate after the outlier test.  weakness: (m,) of ``depth_weakness``.
+    """
     warnings = []
     names = problem.point_names
     if dropped:
@@ -139,6 +159,10 @@ def quality_warnings(problem: BundleProblem, adjustment: Adjustment, dropped: tu
         warnings.append(
             f"{int(unseen.sum())} point(s) are in no image and have no estimate: {listed(named(names, unseen))}"
         )
+    weak = weakness > WEAK_DEPTH
+    if weak.any():
+        text = f"{int(weak.sum())} point(s) are seen under so small an angle that their distance is known to 1 % only"
+        warnings.append(f"{text}: {listed(named(names, weak))}")
     low = adjustment.redundancy_numbers.min(axis=1) < 0.1
     if low.any():
         warnings.append(f"{int(low.sum())} image point(s) have a redundancy number below 0.1: hardly checked")

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from netdesign.adjustment.covariance import datum_covariance
-from netdesign.adjustment.diagnosis import calibration_complaints, point_complaints, quality_warnings
+from netdesign.adjustment.diagnosis import calibration_complaints, depth_weakness, point_complaints, quality_warnings
 from netdesign.adjustment.problem import BundleProblem, check_input, check_start, null_space
 from netdesign.adjustment.snooping import cleaned
 from netdesign.adjustment.solver import Solution, equations, solve
@@ -49,7 +49,11 @@ def estimate(
     before = 0
     if robust:
         scaled, rejected, dropped, before = cleaned(scaled, significance)
-    solution = anchored(solve(scaled), start)
+    try:
+        solution = anchored(solve(scaled), start)
+    except InfeasibleError as error:
+        advice = calibration_complaints(scaled, scaled.refine, None)
+        raise InfeasibleError("; ".join([str(error), *advice])) from None
     adjustment = appraise(solution, unit, centre, joint, rejected, dropped)
     return replace(adjustment, iterations=adjustment.iterations + before)
 
@@ -173,7 +177,8 @@ def appraise(
         lambda8=camera_side.first_eigenvalue,
         rejected=rejected,
     )
-    return replace(adjustment, warnings=quality_warnings(problem, adjustment, dropped))
+    weakness = depth_weakness(problem, layout, reduced)
+    return replace(adjustment, warnings=quality_warnings(problem, adjustment, dropped, weakness))
 
 
 def _parameter_names(problem: BundleProblem) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from netdesign.model.arrays import Floats, frozen
 class CornerNoise:
     """The calibrated noise of a tag corner: ``k`` and ``floor_px`` of the closed form in photogrammetry/precision.
 
-    sigma² = (k · (sigma_n/dI) · s^0.521 · L^-0.538 · cos(i)^-0.436 · exp(0.787 (s/cell)²))² + floor².
+    sigma² = (k · (sigma_n/dI) · s^0.537 · L^-0.506 · cos(i)^-0.400 · exp(1.03 (s/c)² + 0.68 (s/c')²))² + floor².
     """
 
     k: float

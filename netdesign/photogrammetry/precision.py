@@ -1,16 +1,18 @@
 """The precision of a tag corner in an image, before the image exists.
 
-Closed form, fitted to Cramér-Rao bounds of the imaging model (tag sides 12-180 px, incidence 0-75°, blur 0.4-1.5 px;
-residual 8 % rms):
+Closed form, fitted to the Cramér-Rao bounds of the full-pattern fit (tag sides 15-180 px, incidence 0-65°, blur
+0.4-1.5 px, full wells 600-10000 e; residual 4 % rms, 13 % at most):
 
-    sigma² = (k · (sigma_n / dI) · s^0.521 · L^-0.538 · cos(i)^-0.436 · exp(0.787 (s/cell)²))² + floor²
+    sigma² = (k · (sigma_n / dI) · s^0.537 · L^-0.506 · cos(i)^-0.400 · exp(1.03 (s/c)² + 0.68 (s/c')²))² + floor²
 
     s = sqrt(blur² + 1/12)      blur of the optics and of the pixel, px
-    L                           edge of the tag seen face-on, px;  i incidence;  cell = L cos(i) / 8, px
-    sigma_n                     grey-level noise at mid level: shot, read and 8-bit quantisation noise
+    L                           edge of the tag seen face-on, px;  i incidence
+    c = L / 8, c' = c cos(i)    a cell along and across the tilt axis, px
+    sigma_n                     grey-level noise at level 90 of 255: shot, read and 8-bit quantisation noise
     dI                          grey-level step from black to white
 
-It holds for cells of at least 1.2 px.
+An edge of length L under blur s can be placed with sigma ~ sqrt(s/L): the powers are close to a half. The exponential
+is what neighbouring edges lose by running into each other. It holds for cells c' of at least 1.2 px.
 """
 
 import numpy as np
@@ -21,13 +23,14 @@ from netdesign.model.scene import Targets
 from netdesign.photogrammetry.collinearity import in_camera
 
 GREY_STEP = 215.0  # black to white of a printed tag in an 8-bit image
+EDGE_LEVEL = 90.0  # the level whose noise stands for an edge: below the middle, where the dark side weighs more
 CELLS = 8.0  # data cells and black border along an edge of tag36h11
 
 
 def grey_noise(camera: Camera) -> float:
-    """Return the standard deviation of a grey level half way between black and white, in grey levels of 8 bit."""
+    """Return the standard deviation of a grey level on an edge, in grey levels of 8 bit."""
     per_electron = 255.0 / camera.full_well_e
-    return float(np.sqrt(per_electron * 127.5 + (per_electron * camera.read_noise_e) ** 2 + 1.0 / 12.0))
+    return float(np.sqrt(per_electron * EDGE_LEVEL + (per_electron * camera.read_noise_e) ** 2 + 1.0 / 12.0))
 
 
 def corner_sigma(camera: Camera, edge_px: Floats | float, incidence: Floats | float) -> Floats:
@@ -44,14 +47,14 @@ def corner_sigma(camera: Camera, edge_px: Floats | float, incidence: Floats | fl
     # Beyond 89.9° and below a hundredth of a pixel nothing is measured: keep the numbers finite there.
     cosine = np.maximum(np.cos(incidence), 1e-3)
     edge = np.maximum(edge, 1e-2)
-    cell = edge * cosine / CELLS
+    loss = (blur / edge * CELLS) ** 2 * (1.03 + 0.68 / cosine**2)
     noise = (
         camera.corner_noise.k
         * (grey_noise(camera) / GREY_STEP)
-        * blur**0.521
-        * edge**-0.538
-        * cosine**-0.436
-        * np.exp(np.minimum(0.787 * (blur / cell) ** 2, 100.0))
+        * blur**0.537
+        * edge**-0.506
+        * cosine**-0.400
+        * np.exp(np.minimum(loss, 100.0))
     )
     return np.asarray(np.sqrt(noise**2 + camera.corner_noise.floor_px**2))
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from netdesign.adjustment.campaign import Band, Campaign, Member
 from netdesign.model.adjustment import Adjustment, Interval, Validation
 from netdesign.photogrammetry.collinearity import INTRINSIC_NAMES
 from netdesign.photogrammetry.reliability import external_reliability, minimal_detectable_error
@@ -13,8 +14,6 @@ MM = 1e3
 
 
 def adjustment_payload(
-    adjustment: Adjustment, image_names: Sequence[str], point_names: Sequence[str]
-) -> dict[str, Any]:
     adjustment: Adjustment, image_names: Sequence[str], point_names: Sequence[str]
 ) -> dict[str, Any]:
     """Return the contents of adjustment.json (contract, section 4).
@@ -160,4 +159,71 @@ def validation_payload(validation: Validation, point_names: Sequence[str]) -> di
             {"id": name, "error_um": error * 1e6} for name, error in zip(point_names, validation.errors, strict=True)
         ],
         **validation.details,
+    }
+
+
+def campaign_member(name: str, record: dict[str, Any]) -> Member:
+    """Return a network's contribution to the campaign from the contents of its validation.json.
+
+    Args:
+        record: with the entries of ``validation_payload``.
+    """
+    statistics, sums = record["statistics"], record["sums"]
+    errors = [[np.nan if x is None else x * 1e-6 for x in row["error_um"]] for row in record["errors_um"]]
+    return Member(
+        name=name,
+        t_sum=sums["t"],
+        nu=sums["nu"],
+        vpv=sums["vpv"],
+        r=sums["r"],
+        rho=statistics["rho"]["value"],
+        nu_eff=record["nu_eff"],
+        pits={
+            "t": statistics["t_over_nu"]["pit"],
+            "s0_squared": statistics["s0_squared"]["pit"],
+            "f": statistics["f"]["pit"],
+            "rho": statistics["rho"]["pit"],
+        },
+        predicted={key: np.inf if value is None else value * 1e-6 for key, value in record["predicted_rms_um"].items()},
+        achieved=record["achieved_rms_um"] * 1e-6,
+        coverage=statistics["coverage95"]["value"],
+        points_used=record["points_used"],
+        errors=np.array(errors),
+    )
+
+
+def campaign_payload(campaign: Campaign) -> dict[str, Any]:
+    """Return the contents of a run's validation.json: the pooled verdict."""
+    return {
+        "realisations": campaign.members,
+        "equivalent": campaign.equivalent,
+        "statement": campaign.statement,
+        "statistics": {
+            "t_over_nu": interval_payload(campaign.t),
+            "s0_squared": interval_payload(campaign.s0_squared),
+            "f": interval_payload(campaign.f),
+        },
+        "rho": band_payload(campaign.rho),
+        "root_f": band_payload(campaign.root_f),
+        "slope": band_payload(campaign.slope),
+        "kendall": campaign.kendall,
+        "achieved_over_predicted": dict(campaign.against),
+        "uniformity_p": dict(campaign.ks),
+        "pit": {name: list(values) for name, values in campaign.pits.items()},
+        "coverage95": campaign.coverage,
+        "repeats": {
+            name: {"count": repeats.count, "bias_share": repeats.bias_share}
+            for name, repeats in campaign.repeats.items()
+        },
+    }
+
+
+def band_payload(band: Band) -> dict[str, Any]:
+    """Return an estimate with its 90 % interval and margin."""
+    return {
+        "value": band.value,
+        "low": band.low,
+        "high": band.high,
+        "margin": list(band.margin),
+        "equivalent": band.equivalent,
     }

@@ -1,0 +1,253 @@
+"""Many networks, one verdict: is the predicted accuracy the achieved one?
+
+One network cannot confirm a prediction to 10 %; K of them can. Pooled over networks, realisations independent:
+
+    T = Σ Tᵢ ~ chi²(Σ nuᵢ),   v'Pv = Σ ~ chi²(Σ rᵢ),   F = (T/Σnu) / (v'Pv/Σr) ~ F(Σnu, Σr)
+    PIT of every statistic uniform (Kolmogorov-Smirnov)
+    geometric mean of rho, slope of log achieved against log predicted
+
+With real detectors the null hypothesis is never exactly true and a large campaign rejects it for a 2 % error of sigma.
+The decision is therefore one of equivalence (two one-sided tests of 5 %, D. J. Schuirmann,
+J. Pharmacokinet. Biopharm. 15, 1987): the 90 % interval of the geometric mean of rho inside [0.90, 1.11] and that
+of sqrt(F) inside [0.95, 1.05]. The exact p-values are reported beside it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import f, kendalltau, kstest, t
+
+from netdesign.adjustment.statistics import chi2_interval, f_interval
+from netdesign.errors import InfeasibleError
+from netdesign.model.adjustment import Interval, Validation
+from netdesign.model.arrays import Floats
+
+RHO_MARGIN = (0.90, 1.11)
+ROOT_F_MARGIN = (0.95, 1.05)
+LEVEL = 0.99
+
+
+@dataclass(frozen=True, kw_only=True)
+class Member:
+    """What one validated network gives to the campaign.
+
+    Attributes:
+        name: of the network.  t_sum, nu, vpv, r: its sums.  rho, nu_eff: its RMS ratio and effective freedom.
+        pits: of "t", "s0_squared", "f" and "rho".
+        predicted ("limited", "total", "used"), achieved: RMS, m.
+        coverage: share inside the 95 % ellipsoids, of points_used points.
+        errors: (m, 3) m after alignment, rows of NaN without estimate; for repeats of one network.
+    """
+
+    name: str
+    t_sum: float
+    nu: float
+    vpv: float
+    r: float
+    rho: float
+    nu_eff: float
+    pits: dict[str, float]
+    predicted: dict[str, float]
+    achieved: float
+    coverage: float
+    points_used: int
+    errors: Floats | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Band:
+    """An estimate with its 90 % confidence interval and the margin it must stay in."""
+
+    value: float
+    low: float
+    high: float
+    margin: tuple[float, float]
+
+    @property
+    def equivalent(self) -> bool:
+        """Both one-sided tests of 5 % reject a deviation as large as the margin."""
+        return self.margin[0] <= self.low and self.high <= self.margin[1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repeats:
+    """Bias and noise of one network that was realised several times.
+
+    Attributes:
+        count: realisations.  bias_share: share of the mean squared error that all realisations have in common
+            (an unbiased estimate; slightly negative means none).
+    """
+
+    count: int
+    bias_share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Campaign:
+    """The pooled verdict.
+
+    Attributes:
+        members: networks pooled.  t, s0_squared, f: pooled statistics with exact intervals.
+        rho: geometric mean of achieved / predicted from the observations used; root_f: square root of the pooled F.
+        against: geometric mean of achieved / predicted for "limited", "total" and "used".
+        slope: of log achieved against log predicted, with its 90 % interval; nan with fewer than three networks.
+        kendall: rank correlation of predicted and achieved; nan with fewer than three networks.
+        ks: p-value of the PITs' uniformity per statistic.  pits: the PITs, for histograms.
+        coverage: share of all points inside their 95 % ellipsoids.
+        repeats: by network, where it was realised more than once.
+        equivalent: the decision.  statement: in words.
+    """
+
+    members: int
+    t: Interval
+    s0_squared: Interval
+    f: Interval
+    rho: Band
+    root_f: Band
+    against: dict[str, float]
+    slope: Band
+    kendall: float
+    ks: dict[str, float]
+    pits: dict[str, tuple[float, ...]]
+    coverage: float
+    equivalent: bool
+    statement: str
+    repeats: dict[str, Repeats] = field(default_factory=dict)
+
+
+def member_of(name: str, validation: Validation) -> Member:
+    """Return what a validation gives to the campaign."""
+    sums = validation.sums
+    return Member(
+        name=name,
+        t_sum=sums["t"],
+        nu=sums["nu"],
+        vpv=sums["vpv"],
+        r=sums["r"],
+        rho=validation.rho.value,
+        nu_eff=validation.nu_eff,
+        pits={
+            "t": validation.t.pit,
+            "s0_squared": validation.s0_squared.pit,
+            "f": validation.f.pit,
+            "rho": validation.rho.pit,
+        },
+        predicted=dict(validation.predicted),
+        achieved=validation.achieved_rms,
+        coverage=validation.coverage.value,
+        points_used=validation.points_used,
+        errors=validation.errors,
+    )
+
+
+def pool(members: Sequence[Member], level: float = LEVEL) -> Campaign:
+    """Pool networks (and repeats of them) into one verdict.
+
+    Raises:
+        InfeasibleError: nothing to pool.
+    """
+    if not members:
+        raise InfeasibleError("campaign: no network was adjusted, nothing to pool")
+    nu, r = sum(m.nu for m in members), sum(m.r for m in members)
+    t_mean, s0 = sum(m.t_sum for m in members) / nu, sum(m.vpv for m in members) / r
+    ratio = t_mean / s0
+    low, high = f.ppf([0.05, 0.95], nu, r)
+    root_f = Band(
+        value=float(np.sqrt(ratio)),
+        low=float(np.sqrt(ratio / high)),
+        high=float(np.sqrt(ratio / low)),
+        margin=ROOT_F_MARGIN,
+    )
+    rho = _geometric_mean(members)
+    pits = {name: tuple(m.pits[name] for m in members) for name in ("t", "s0_squared", "f", "rho")}
+    slope, kendall = _trend(members)
+    points = sum(m.points_used for m in members)
+    equivalent = rho.equivalent and root_f.equivalent
+    return Campaign(
+        members=len(members),
+        t=chi2_interval(t_mean, int(nu), level),
+        s0_squared=chi2_interval(s0, int(r), level),
+        f=f_interval(ratio, int(nu), int(r), level),
+        rho=rho,
+        root_f=root_f,
+        against={
+            name: float(np.exp(np.mean([np.log(m.achieved / m.predicted[name]) for m in members])))
+            for name in ("limited", "total", "used")
+            if all(m.predicted.get(name) and np.isfinite(m.predicted[name]) for m in members)
+        },
+        slope=slope,
+        kendall=kendall,
+        ks={name: float(kstest(values, "uniform").pvalue) for name, values in pits.items()},
+        pits=pits,
+        coverage=float(sum(m.coverage * m.points_used for m in members) / points),
+        equivalent=equivalent,
+        statement=_statement(len(members), rho, root_f),
+        repeats=_repeats(members),
+    )
+
+
+def _geometric_mean(members: Sequence[Member]) -> Band:
+    """Return the geometric mean of rho with its 90 % interval.
+
+    The scatter of log rho is taken from the sample or from theory, sqrt(1 / (2 nu_eff)), whichever is larger: few
+    networks that happen to agree prove nothing.
+    """
+    logs = np.log([m.rho for m in members])
+    count = len(logs)
+    theory = float(np.sqrt(np.mean([1.0 / (2.0 * m.nu_eff) for m in members]) / count))
+    half = 1.645 * theory
+    if count > 1:
+        half = max(half, float(t.ppf(0.95, count - 1) * logs.std(ddof=1) / np.sqrt(count)))
+    mean = float(logs.mean())
+    return Band(
+        value=float(np.exp(mean)), low=float(np.exp(mean - half)), high=float(np.exp(mean + half)), margin=RHO_MARGIN
+    )
+
+
+def _trend(members: Sequence[Member]) -> tuple[Band, float]:
+    """Return slope of log achieved against log predicted (weights 2 nu_eff), and Kendall's rank correlation."""
+    x = np.log([m.predicted["used"] for m in members])
+    y = np.log([m.achieved for m in members])
+    margin = (0.9, 1.1)
+    if len(members) < 3 or np.ptp(x) < 1e-6:
+        return Band(value=float("nan"), low=float("nan"), high=float("nan"), margin=margin), float("nan")
+    weight = np.array([2.0 * m.nu_eff for m in members])
+    centre = float((weight * x).sum() / weight.sum())
+    scatter = float((weight * (x - centre) ** 2).sum())
+    value = float((weight * (x - centre) * y).sum() / scatter)
+    residual = y - value * (x - centre) - (weight * y).sum() / weight.sum()
+    dof = len(members) - 2
+    factor = max(1.0, float((weight * residual**2).sum() / dof))
+    half = float(t.ppf(0.95, dof) * np.sqrt(factor / scatter))
+    return Band(value=value, low=value - half, high=value + half, margin=margin), float(kendalltau(x, y).statistic)
+
+
+def _repeats(members: Sequence[Member]) -> dict[str, Repeats]:
+    """Return bias against noise for every network that was realised more than once."""
+    result: dict[str, Repeats] = {}
+    for name in sorted({m.name for m in members}):
+        errors = [m.errors for m in members if m.name == name and m.errors is not None]
+        if len(errors) < 2:
+            continue
+        stack = np.stack(errors)
+        stack = stack[:, np.isfinite(stack).all(axis=(0, 2))]
+        mean_square, count = float((stack**2).sum(axis=(1, 2)).mean()), len(errors)
+        common = float((stack.mean(axis=0) ** 2).sum())
+        # E|mean|² = bias² + noise²/R and E|d|² = bias² + noise²: solve for the bias.
+        bias = (count * common - mean_square) / (count - 1)
+        result[name] = Repeats(count=count, bias_share=bias / mean_square)
+    return result
+
+
+def _statement(count: int, rho: Band, root_f: Band) -> str:
+    """Return the verdict in one sentence."""
+    verdict = "is" if rho.equivalent and root_f.equivalent else "is not"
+    bands = [
+        f"{band.value:.3f} [{band.low:.3f}, {band.high:.3f}] against [{band.margin[0]:.2f}, {band.margin[1]:.2f}]"
+        for band in (rho, root_f)
+    ]
+    return (
+        f"Over {count} realisation(s) the predicted accuracy {verdict} shown to be the achieved one. With 90 % intervals: "
+        f"achieved / predicted {bands[0]}; geometry alone, sqrt(F), {bands[1]}."
+    )

@@ -1,0 +1,213 @@
+"""Limited error propagation: the covariance of each object point when the poses are error-free.
+
+Every image that sees a point adds its observation equations to the point's own 3x3 normal matrix:
+
+    N_j = Σ_i J_ijᵀ J_ij / sigma_ij²,      Q_j = N_j⁻¹,      f1 = Σ_j tr Q_j / 3m
+
+("limiting error propagation" in the photogrammetric literature; equation 2 of the source paper.) Three forms:
+
+* :func:`limited_covariance`: numpy, any pose, with distortion. The reference, and what is reported.
+* :func:`direct_covariance`: the same, compiled.
+* the moment form, for the search: undistorted cameras that look at the centre of a sphere of radius R. With u the
+  direction of the camera from the centre and P the point relative to it, z = R - u·P and
+
+      Jᵀ J = f² / z⁴ · (|d|² I - d dᵀ - (P × u)(P × u)ᵀ),   d = P - R u
+
+  does not depend on the roll and is linear in the camera's products, so that nine sums per point are enough:
+  s = weight / z⁴, S_u += s u (3), S_uu += s u uᵀ (6), and Σ s = tr S_uu. N follows once per point.
+"""
+
+import numpy as np
+from numba import njit
+
+from netdesign.model.arrays import Bools, Floats
+from netdesign.photogrammetry.collinearity import project_with_jacobians
+
+SINGULAR = 1e-13
+"""det N / (tr N)³ below which a point counts as undetermined: its rays are parallel to rounding."""
+
+WEAK = 1e-6
+"""det N / (tr N)³ below which the search refuses a point: two rays that meet at less than about 0.4 degrees."""
+
+_FAST = {"contract", "reassoc", "arcp", "nsz"}  # never nnan or ninf: infinite sigmas must stay visible
+
+
+def limited_covariance(
+    world_from_cam: Floats, points: Floats, intrinsics: Floats, visible: Bools, sigma_px: Floats | float
+) -> Floats:
+    """Return the covariance (m, 3, 3) in m² of every object point; inf where the rays do not determine it.
+
+    Args:
+        world_from_cam: (n, 4, 4) m.  points: (m, 3) m.  intrinsics: (8,).
+        visible: (n, m) which image sees which point.  sigma_px: one sigma, or (n, m).
+    """
+    derivative = project_with_jacobians(world_from_cam[:, None], points[None], intrinsics).d_xy_d_point
+    weight = np.where(visible, 1.0 / np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), visible.shape) ** 2, 0.0)
+    derivative = np.where(visible[..., None, None], derivative, 0.0)
+    normal = np.einsum("nm,nmri,nmrj->mij", weight, derivative, derivative, optimize=True)
+    return invert_normals(normal)
+
+
+def invert_normals(normal: Floats) -> Floats:
+    """Return the inverses (m, 3, 3) of normal matrices; inf where det N <= SINGULAR (tr N)³."""
+    determined = conditioning(normal) > SINGULAR
+    inverse = np.linalg.inv(np.where(determined[:, None, None], normal, np.eye(3)))
+    inverse = 0.5 * (inverse + np.swapaxes(inverse, 1, 2))
+    return np.where(determined[:, None, None], inverse, np.inf)
+
+
+def conditioning(normal: Floats) -> Floats:
+    """Return det N / (tr N)³ (m,) of matrices (m, 3, 3): 1/27 for isotropic points, 0 for undetermined ones."""
+    trace = np.trace(normal, axis1=1, axis2=2)
+    scaled = normal / np.where(trace > 0, trace, 1.0)[:, None, None]
+    return np.where(trace > 0, np.linalg.det(scaled), 0.0)
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
+def direct_covariance(
+    world_from_cam: Floats, points: Floats, intrinsics: Floats, visible: Bools, sigma_px: Floats
+) -> Floats:
+    """Return what :func:`limited_covariance` returns, compiled; ``sigma_px`` (n, m), or (1, 1) for one sigma."""
+    images, count = visible.shape
+    covariance = np.full((count, 3, 3), np.inf)
+    fx, fy = intrinsics[0], intrinsics[1]
+    k1, k2, p1, p2 = intrinsics[4], intrinsics[5], intrinsics[6], intrinsics[7]
+    constant = sigma_px.size == 1
+    for j in range(count):
+        xx = xy = xz = yy = yz = zz = 0.0
+        for i in range(images):
+            if not visible[i, j]:
+                continue
+            pose = world_from_cam[i]
+            d0, d1, d2 = points[j, 0] - pose[0, 3], points[j, 1] - pose[1, 3], points[j, 2] - pose[2, 3]
+            depth = 1.0 / (pose[0, 2] * d0 + pose[1, 2] * d1 + pose[2, 2] * d2)
+            a = (pose[0, 0] * d0 + pose[1, 0] * d1 + pose[2, 0] * d2) * depth
+            b = (pose[0, 1] * d0 + pose[1, 1] * d1 + pose[2, 1] * d2) * depth
+            r2 = a * a + b * b
+            radial, slope = 1.0 + r2 * (k1 + k2 * r2), 2.0 * (k1 + 2.0 * k2 * r2)
+            mixed = a * b * slope + 2.0 * (p1 * a + p2 * b)
+            along = depth / (sigma_px[0, 0] if constant else sigma_px[i, j])
+            ua, ub = fx * along * (radial + a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a), fx * along * mixed
+            va, vb = fy * along * mixed, fy * along * (radial + b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a)
+            uc, vc = -(ua * a + ub * b), -(va * a + vb * b)
+            u0 = ua * pose[0, 0] + ub * pose[0, 1] + uc * pose[0, 2]
+            u1 = ua * pose[1, 0] + ub * pose[1, 1] + uc * pose[1, 2]
+            u2 = ua * pose[2, 0] + ub * pose[2, 1] + uc * pose[2, 2]
+            v0 = va * pose[0, 0] + vb * pose[0, 1] + vc * pose[0, 2]
+            v1 = va * pose[1, 0] + vb * pose[1, 1] + vc * pose[1, 2]
+            v2 = va * pose[2, 0] + vb * pose[2, 1] + vc * pose[2, 2]
+            xx += u0 * u0 + v0 * v0
+            xy += u0 * u1 + v0 * v1
+            xz += u0 * u2 + v0 * v2
+            yy += u1 * u1 + v1 * v1
+            yz += u1 * u2 + v1 * v2
+            zz += u2 * u2 + v2 * v2
+        c00, c01, c02 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+        determinant, trace = xx * c00 + xy * c01 + xz * c02, xx + yy + zz
+        if determinant > SINGULAR * trace * trace * trace:
+            covariance[j, 0, 0], covariance[j, 1, 1] = c00 / determinant, (xx * zz - xz * xz) / determinant
+            covariance[j, 2, 2] = (xx * yy - xy * xy) / determinant
+            covariance[j, 0, 1] = covariance[j, 1, 0] = c01 / determinant
+            covariance[j, 0, 2] = covariance[j, 2, 0] = c02 / determinant
+            covariance[j, 1, 2] = covariance[j, 2, 1] = (xz * xy - xx * yz) / determinant
+    return covariance
+
+
+LANES = 16
+"""Points per block of the moment form; within a block the rows of an array follow each other, LANES numbers each."""
+
+
+def blocked(rows: Floats) -> Floats:
+    """Return rows (k, m), one number per point, as one flat array of blocks (blocks, k, LANES); padded with zeros.
+
+    All rows of a block lie at constant distances, so that the compiler sees that they do not overlap and vectorises.
+    """
+    count = -(-rows.shape[1] // LANES)
+    padded = np.zeros((len(rows), count * LANES))
+    padded[:, : rows.shape[1]] = rows
+    return np.ascontiguousarray(padded.reshape(len(rows), count, LANES).transpose(1, 0, 2)).ravel()
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
+def add_four_cameras(moments: Floats, points: Floats, directions: Floats, weights: Floats, radius: float) -> None:
+    """Add four cameras to the moments of all points: one pass over memory, weights instead of branches.
+
+    Args:
+        moments: blocks of 9 rows, xx, xy, xz, yy, yz, zz of S_uu, then S_u; changed in place.
+        points: blocks of 3 rows, x, y, z relative to the sphere's centre, m.
+        directions: (4, 3) unit vectors of the cameras.
+        weights: blocks of 4 rows: 1 or 1/sigma² where the camera sees the point, 0 where not; negative takes away.
+        radius: R in m.
+    """
+    ax, ay, az = directions[0, 0], directions[0, 1], directions[0, 2]
+    bx, by, bz = directions[1, 0], directions[1, 1], directions[1, 2]
+    cx, cy, cz = directions[2, 0], directions[2, 1], directions[2, 2]
+    dx, dy, dz = directions[3, 0], directions[3, 1], directions[3, 2]
+    for block in range(len(points) // (3 * LANES)):
+        p0, w0 = np.uint64(block) * np.uint64(3 * LANES), np.uint64(block) * np.uint64(4 * LANES)
+        s0 = np.uint64(block) * np.uint64(9 * LANES)
+        for lane in range(LANES):
+            p, w, s = p0 + np.uint64(lane), w0 + np.uint64(lane), s0 + np.uint64(lane)
+            x, y, z = points[p], points[p + np.uint64(LANES)], points[p + np.uint64(2 * LANES)]
+            a, b = radius - (ax * x + ay * y + az * z), radius - (bx * x + by * y + bz * z)
+            c, d = radius - (cx * x + cy * y + cz * z), radius - (dx * x + dy * y + dz * z)
+            a, b, c, d = a * a, b * b, c * c, d * d
+            a, b = weights[w] / (a * a), weights[w + np.uint64(LANES)] / (b * b)
+            c, d = weights[w + np.uint64(2 * LANES)] / (c * c), weights[w + np.uint64(3 * LANES)] / (d * d)
+            a_x, b_x, c_x, d_x = a * ax, b * bx, c * cx, d * dx
+            a_y, b_y, c_y, d_y = a * ay, b * by, c * cy, d * dy
+            a_z, b_z, c_z, d_z = a * az, b * bz, c * cz, d * dz
+            moments[s] += a_x * ax + b_x * bx + c_x * cx + d_x * dx
+            moments[s + np.uint64(LANES)] += a_x * ay + b_x * by + c_x * cy + d_x * dy
+            moments[s + np.uint64(2 * LANES)] += a_x * az + b_x * bz + c_x * cz + d_x * dz
+            moments[s + np.uint64(3 * LANES)] += a_y * ay + b_y * by + c_y * cy + d_y * dy
+            moments[s + np.uint64(4 * LANES)] += a_y * az + b_y * bz + c_y * cz + d_y * dz
+            moments[s + np.uint64(5 * LANES)] += a_z * az + b_z * bz + c_z * cz + d_z * dz
+            moments[s + np.uint64(6 * LANES)] += a_x + b_x + c_x + d_x
+            moments[s + np.uint64(7 * LANES)] += a_y + b_y + c_y + d_y
+            moments[s + np.uint64(8 * LANES)] += a_z + b_z + c_z + d_z
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
+def variances_from_moments(moments: Floats, points: Floats, radius: float, count: int, variances: Floats) -> int:
+    """Write the variances along x, y, z and return how many points are WEAK (their variances mean nothing).
+
+    Args:
+        moments, points, radius: as in :func:`add_four_cameras`.
+        count: m; what pads the last block gets variance 0.
+        variances: blocks of 3 rows, in units of 1 / f² (m² when multiplied by sigma² / f² for unit weights).
+    """
+    weak = 0
+    square = radius * radius
+    for block in range(len(points) // (3 * LANES)):
+        p0, s0 = np.uint64(block) * np.uint64(3 * LANES), np.uint64(block) * np.uint64(9 * LANES)
+        left = count - block * LANES
+        for lane in range(LANES):
+            p, s = p0 + np.uint64(lane), s0 + np.uint64(lane)
+            x, y, z = points[p], points[p + np.uint64(LANES)], points[p + np.uint64(2 * LANES)]
+            sxx, sxy, sxz = moments[s], moments[s + np.uint64(LANES)], moments[s + np.uint64(2 * LANES)]
+            syy, syz = moments[s + np.uint64(3 * LANES)], moments[s + np.uint64(4 * LANES)]
+            szz, sx = moments[s + np.uint64(5 * LANES)], moments[s + np.uint64(6 * LANES)]
+            sy, sz = moments[s + np.uint64(7 * LANES)], moments[s + np.uint64(8 * LANES)]
+            total = sxx + syy + szz
+            # |d|² summed over the cameras; N = spread I - A - B with A the d dᵀ part, B = [P]x S_uu [P]xᵀ.
+            spread = total * (x * x + y * y + z * z + square) - 2.0 * radius * (x * sx + y * sy + z * sz)
+            a0, a1, a2 = y * sxz - z * sxy, y * syz - z * syy, y * szz - z * syz
+            b0, b1, b2 = z * sxx - x * sxz, z * sxy - x * syz, z * sxz - x * szz
+            c0, c1 = x * sxy - y * sxx, x * syy - y * sxy
+            nxx = spread - (total * x * x - 2.0 * radius * x * sx + square * sxx) - (y * a2 - z * a1)
+            nyy = spread - (total * y * y - 2.0 * radius * y * sy + square * syy) - (z * b0 - x * b2)
+            nzz = spread - (total * z * z - 2.0 * radius * z * sz + square * szz) - (x * c1 - y * c0)
+            nxy = radius * (x * sy + y * sx) - total * x * y - square * sxy - (z * a0 - x * a2)
+            nxz = radius * (x * sz + z * sx) - total * x * z - square * sxz - (x * a1 - y * a0)
+            nyz = radius * (y * sz + z * sy) - total * y * z - square * syz - (x * b1 - y * b0)
+            cxx, cyy, czz = nyy * nzz - nyz * nyz, nxx * nzz - nxz * nxz, nxx * nyy - nxy * nxy
+            determinant = nxx * cxx + nxy * (nxz * nyz - nxy * nzz) + nxz * (nxy * nyz - nxz * nyy)
+            trace = nxx + nyy + nzz
+            real = lane < left
+            weak += int(real & (determinant <= WEAK * trace * trace * trace))
+            scale = 1.0 / determinant if real else 0.0
+            variances[p] = cxx * scale if real else 0.0
+            variances[p + np.uint64(LANES)] = cyy * scale if real else 0.0
+            variances[p + np.uint64(2 * LANES)] = czz * scale if real else 0.0
+    return weak

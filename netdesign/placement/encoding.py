@@ -1,0 +1,123 @@
+"""The structured chromosome of a camera network, n bits and n (alpha, beta) pairs, and what breeds it.
+
+``vary_plain`` is the source paper: uniform crossover and bit flips, SBX and polynomial mutation of the angles, slot by
+slot. ``vary_structured`` knows that slots have no meaning and angles lie on a sphere: a random plane cuts both parents,
+a child takes one's cameras on this side and the other's on that side; then cameras are nudged, moved, added or removed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from netdesign.model.arrays import Bools, Floats
+from netdesign.model.frames import sphere_directions, viewpoints_of
+from netdesign.model.task import ViewingSphere
+from netdesign.search.operators import flip_bits, polynomial_mutation, sbx, uniform_crossover
+from netdesign.search.population import Population
+
+CROSSOVER, SBX_ETA, MUTATION_ETA = 0.9, 15.0, 20.0
+SMALLEST_STEP, LARGEST_STEP = 0.002, 0.5  # rad, of a nudged camera, log-uniform
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chromosomes:
+    """The space of chromosomes over a viewing sphere.
+
+    Attributes:
+        sphere: the admissible viewpoints.  slots: n.
+    """
+
+    sphere: ViewingSphere
+    slots: int
+
+    @property
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Lower and upper (2,) of (alpha, beta), rad."""
+        (low_a, high_a), (low_b, high_b) = self.sphere.azimuth, self.sphere.elevation
+        return np.array([low_a, low_b]), np.array([high_a, high_b])
+
+    def uniform(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Floats:
+        """Return viewpoints (*shape, 2), uniform over the admissible area."""
+        lower, upper = self.bounds
+        alpha = rng.uniform(lower[0], upper[0], shape)
+        beta = np.arcsin(rng.uniform(np.sin(lower[1]), np.sin(upper[1]), shape))
+        return np.stack([alpha, beta], axis=-1)
+
+    def folded(self, viewpoints: Floats) -> Floats:
+        """Return viewpoints (…, 2) brought into the bounds: the azimuth wraps, what is still outside is clipped."""
+        lower, upper = self.bounds
+        middle = 0.5 * (lower[0] + upper[0])
+        alpha = middle + np.remainder(viewpoints[..., 0] - middle + np.pi, 2 * np.pi) - np.pi
+        return np.asarray(np.clip(np.stack([alpha, viewpoints[..., 1]], axis=-1), lower, upper))
+
+    def random(self, rng: np.random.Generator, count: int) -> tuple[Bools, Floats]:
+        """Return ``count`` chromosomes: sizes spread evenly from 2 to n, viewpoints uniform over the area."""
+        sizes = rng.integers(min(2, self.slots), self.slots + 1, count)
+        bits = np.argsort(rng.random((count, self.slots)), axis=1) < sizes[:, None]
+        return bits, self.uniform(rng, (count, self.slots))
+
+    def vary_plain(self, rng: np.random.Generator, first: Population, second: Population) -> tuple[Bools, Floats]:
+        """Return two children per pair of parents by the source paper's operators."""
+        lower, upper = (np.tile(bound, self.slots) for bound in self.bounds)
+        bits = uniform_crossover(rng, first.bits, second.bits, CROSSOVER)
+        bits = flip_bits(rng, bits, 1.0 / self.slots)
+        flat = (len(first), 2 * self.slots)
+        genes = sbx(rng, first.genes.reshape(flat), second.genes.reshape(flat), lower, upper, CROSSOVER, SBX_ETA)
+        genes = polynomial_mutation(rng, genes, lower, upper, 0.5 / self.slots, MUTATION_ETA)
+        return bits, genes.reshape(len(bits), self.slots, 2)
+
+    def vary_structured(self, rng: np.random.Generator, first: Population, second: Population) -> tuple[Bools, Floats]:
+        """Return two children per pair of parents: cut and splice, then one structural mutation each."""
+        bits, genes = self._splice(rng, first, second)
+        return self._mutate(rng, bits, genes)
+
+    def _splice(self, rng: np.random.Generator, first: Population, second: Population) -> tuple[Bools, Floats]:
+        pairs = len(first)
+        normal = rng.normal(size=(pairs, 3))
+        through = sphere_directions(self.uniform(rng, (pairs,)))  # the plane passes through a random viewpoint
+        genes = np.concatenate([first.genes, second.genes], axis=1)
+        bits = np.concatenate([first.bits, second.bits], axis=1)
+        above = np.einsum("pnx,px->pn", sphere_directions(genes) - through[:, None], normal) > 0
+        from_first = np.arange(2 * self.slots) < self.slots
+        chosen = np.concatenate([bits & (above == from_first), bits & (above != from_first)])
+        # Chosen cameras first, in random order; what does not fit into the slots is lost.
+        order = np.argsort(rng.random(chosen.shape) + ~chosen, axis=1)[:, : self.slots]
+        return np.take_along_axis(chosen, order, axis=1), np.take_along_axis(
+            np.concatenate([genes, genes]), order[..., None], axis=1
+        )
+
+    def _mutate(self, rng: np.random.Generator, bits: Bools, genes: Floats) -> tuple[Bools, Floats]:
+        """Nudge some cameras of half of the rows; move, add or remove one camera in the others."""
+        rows = np.arange(len(bits))
+        kind = rng.random(len(bits))
+        size = bits.sum(axis=1)
+        nudged = bits & (rng.random(bits.shape) < 1.5 / np.maximum(size, 1)[:, None]) & (kind < 0.5)[:, None]
+        genes = np.where(nudged[..., None], self.nudged(rng, genes), genes)
+        draw = rng.random(bits.shape)
+        active = np.argmax(np.where(bits, draw, -1.0), axis=1)
+        idle = np.argmax(np.where(bits, -1.0, draw), axis=1)
+        elsewhere = self.uniform(rng, (len(bits),))
+        moving = (kind >= 0.5) & (kind < 0.66) & (size > 0)
+        genes[rows[moving], active[moving]] = elsewhere[moving]
+        adding = (kind >= 0.66) & (kind < 0.83) & (size < self.slots)
+        genes[rows[adding], idle[adding]] = elsewhere[adding]
+        bits = bits.copy()
+        bits[rows[adding], idle[adding]] = True
+        removing = (kind >= 0.83) & (size > 2)
+        bits[rows[removing], active[removing]] = False
+        return bits, genes
+
+    def nudged(self, rng: np.random.Generator, viewpoints: Floats) -> Floats:
+        """Return viewpoints (…, 2) after a step of log-uniform length in a random direction along the sphere."""
+        shape = viewpoints.shape[:-1]
+        length = np.exp(rng.uniform(np.log(SMALLEST_STEP), np.log(LARGEST_STEP), shape))
+        return self.stepped(viewpoints, rng.uniform(-np.pi, np.pi, shape), length)
+
+    def stepped(self, viewpoints: Floats, bearing: Floats, length: Floats) -> Floats:
+        """Return viewpoints (…, 2) moved by ``length`` (…) rad along great circles; bearing (…) from east to north."""
+        alpha = viewpoints[..., 0]
+        east = np.stack([-np.sin(alpha), np.cos(alpha), np.zeros_like(alpha)], axis=-1)
+        up = sphere_directions(viewpoints)
+        along = np.cos(bearing)[..., None] * east + np.sin(bearing)[..., None] * np.cross(up, east)
+        moved = np.cos(length)[..., None] * up + np.sin(length)[..., None] * along
+        return self.folded(viewpoints_of(moved))

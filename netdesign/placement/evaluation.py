@@ -1,0 +1,181 @@
+"""The search's evaluation of networks, compiled: visibility bits, limited error, tour, violation.
+
+A network's violation is the sum of what is missing: rays per tag, tags per image, stations out of reach, points whose
+rays are nearly parallel, and the part of the tour beyond the longest admissible one. Infeasible networks skip what
+follows the first failing stage. What is reported is computed anew, exactly, in ``finish``.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.motion.joint_tour import network_tour
+from netdesign.motion.tour import path_length
+from netdesign.photogrammetry.limited_error import LANES, add_four_cameras, variances_from_moments
+from netdesign.placement.visibility_map import cell_index
+
+MEAN_VARIANCE, MAX_SIGMA = 0, 1
+
+
+class SphereTables(NamedTuple):
+    """What the kernels look up; arrays of the visibility map are described there.
+
+    Attributes:
+        points: blocks of x, y, z relative to the centre (``limited_error.blocked``).  point_count: m.  tags: g.
+        radius: R in m.  grid, sure: of the VisibilityMap.
+        weight: (rows, g) 1 / sigma² of a sighting relative to ``variance``; one row when sigma is constant.
+        weight_grid: (6,) grid of the rows of ``weight``.
+        variance: m² per unit of the moment form, sigma² / f².
+        min_rays, min_tags: images per tag, tags per image.
+        criterion: MEAN_VARIANCE or MAX_SIGMA.  longest: admissible f2.
+    """
+
+    points: Floats
+    point_count: int
+    tags: int
+    radius: float
+    grid: Floats
+    sure: NDArray[np.uint64]
+    weight: Floats
+    weight_grid: Floats
+    variance: float
+    min_rays: int
+    min_tags: int
+    criterion: int
+    longest: float
+
+
+class JointTables(NamedTuple):
+    """What the joint-space tour looks up: arrays of the JointMap; law, timed and dwell (s) of ``motion.joint_tour``."""
+
+    arrays: Any
+    law: Floats
+    timed: bool
+    dwell: float
+
+
+@njit(cache=True, error_model="numpy")
+def popcount(word: np.uint64) -> int:
+    """Return the number of bits set in 64 bits (SWAR; H. S. Warren, Hacker's Delight, chapter 5)."""
+    word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return int((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@njit(cache=True, error_model="numpy")
+def missing_sightings(cells: Ints, tables: SphereTables, at_least: NDArray[np.uint64]) -> float:
+    """Return the rays that tags lack plus the shares of tags that images lack, for images in ``cells`` (k,).
+
+    at_least: (min_rays, words) scratch; row r ends up as the bits of the tags seen more than r times.
+    """
+    words = tables.sure.shape[1]
+    at_least[:] = np.uint64(0)
+    lacking = 0.0
+    for cell in cells:
+        seen = 0
+        for w in range(words):
+            row = tables.sure[cell, w]
+            seen += popcount(row)
+            for r in range(tables.min_rays - 1, 0, -1):
+                at_least[r, w] |= at_least[r - 1, w] & row
+            at_least[0, w] |= row
+        if seen < tables.min_tags:
+            lacking += float(tables.min_tags - seen) / tables.min_tags
+    for r in range(tables.min_rays):
+        enough = 0
+        for w in range(words):
+            enough += popcount(at_least[r, w])
+        lacking += tables.tags - enough
+    return lacking
+
+
+@njit(cache=True, error_model="numpy")
+def write_direction(alpha: float, beta: float, direction: Floats) -> None:
+    """Write the unit vector (3,) of a viewpoint."""
+    flat = np.cos(beta)
+    direction[0], direction[1], direction[2] = flat * np.cos(alpha), flat * np.sin(alpha), np.sin(beta)
+
+
+@njit(cache=True, error_model="numpy")
+def write_weights(
+    alpha: float, beta: float, cell: int, sign: float, slot: int, tables: SphereTables, weights: Floats
+) -> None:
+    """Write into ``slot`` of blocks of 4 rows what each point's sighting from a viewpoint weighs, times ``sign``."""
+    row = 0 if len(tables.weight) == 1 else cell_index(alpha, beta, tables.weight_grid)
+    for g in range(tables.tags):
+        bit = (tables.sure[cell, g >> 6] >> np.uint64(g & 63)) & np.uint64(1)
+        value = sign * tables.weight[row, g] if bit else 0.0
+        start = (g >> 2) * (4 * LANES) + slot * LANES + (g & 3) * 4
+        weights[start], weights[start + 1], weights[start + 2], weights[start + 3] = value, value, value, value
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
+def precision_objective(variances: Floats, tables: SphereTables) -> float:
+    """Return f1 from the variances: their mean in m², or the square root of the largest in m."""
+    if tables.criterion == MAX_SIGMA:
+        largest = 0.0
+        for value in variances:
+            largest = max(largest, value)
+        return float(np.sqrt(largest * tables.variance))
+    total = 0.0
+    for value in variances:
+        total += value
+    return total * tables.variance / (3 * tables.point_count)
+
+
+@njit(cache=True, error_model="numpy")
+def motion_objective(viewpoints: Floats, directions: Floats, tables: SphereTables, joint: Any) -> tuple[float, int]:
+    """Return (f2, stations out of reach) of viewpoints (k, 2) with directions (k, 3); workspace when joint is None."""
+    if joint is None:
+        return tables.radius * path_length(directions), 0
+    else:
+        found: tuple[float, int] = network_tour(joint.arrays, joint.law, joint.timed, joint.dwell, viewpoints)
+        return found
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def evaluate_networks(
+    bits: Bools, genes: Floats, tables: SphereTables, joint: Any, objectives: Floats, violation: Floats
+) -> None:
+    """Write objectives (P, 3) and violation (P,) of chromosomes: bits (P, n), genes (P, n, 2) = (alpha, beta) rad."""
+    count, slots = bits.shape
+    blocks = len(tables.points) // (3 * LANES)
+    viewpoints, directions = np.zeros((slots, 2)), np.zeros((slots, 3))
+    four = np.zeros((4, 3))
+    cells = np.zeros(slots, np.int64)
+    at_least = np.zeros((tables.min_rays, tables.sure.shape[1]), np.uint64)
+    weights, moments = np.zeros(blocks * 4 * LANES), np.zeros(blocks * 9 * LANES)
+    variances = np.zeros(blocks * 3 * LANES)
+    for p in range(count):
+        k = 0
+        for slot in range(slots):
+            if bits[p, slot]:
+                alpha, beta = genes[p, slot, 0], genes[p, slot, 1]
+                viewpoints[k, 0], viewpoints[k, 1] = alpha, beta
+                write_direction(alpha, beta, directions[k])
+                cells[k] = cell_index(alpha, beta, tables.grid)
+                k += 1
+        objectives[p, 0], objectives[p, 1], objectives[p, 2] = np.inf, np.inf, k
+        violation[p] = missing_sightings(cells[:k], tables, at_least)
+        if violation[p] > 0:
+            continue
+        for s in range(len(moments)):
+            moments[s] = 0.0
+        for first in range(0, k, 4):
+            for slot in range(4):
+                i = first + slot
+                if i < k:
+                    write_weights(viewpoints[i, 0], viewpoints[i, 1], cells[i], 1.0, slot, tables, weights)
+                    for axis in range(3):
+                        four[slot, axis] = directions[i, axis]
+                else:
+                    write_weights(0.0, 0.0, cells[0], 0.0, slot, tables, weights)
+            add_four_cameras(moments, tables.points, four, weights, tables.radius)
+        weak = variances_from_moments(moments, tables.points, tables.radius, tables.point_count, variances)
+        length, refused = motion_objective(viewpoints[:k], directions[:k], tables, joint)
+        objectives[p, 0], objectives[p, 1] = precision_objective(variances, tables), length
+        violation[p] = weak + refused + max(0.0, length / tables.longest - 1.0)

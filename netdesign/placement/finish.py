@@ -1,0 +1,246 @@
+"""From the archive of a search to the reported front: every number exact.
+
+The search works on proved visibility bits, undistorted optics and heuristic tours; here each kept network gets exact
+rays, the covariance with distortion, the exact tour, total error propagation and its bound. What turns out inadmissible
+or dominated is dropped and counted.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from netdesign.errors import InfeasibleError
+from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.progress import Progress, silent
+from netdesign.model.results import Design, DesignedNetwork, PointPrecision, SearchHistory, Tour
+from netdesign.model.task import Task
+from netdesign.motion.tour import open_path
+from netdesign.photogrammetry.limited_error import limited_covariance
+from netdesign.photogrammetry.precision import sighting_sigma
+from netdesign.photogrammetry.total_error import total_covariance
+from netdesign.photogrammetry.visibility import Sight
+from netdesign.placement.bound import lower_bounds
+from netdesign.placement.problem import Problem
+from netdesign.search.archive import non_dominated
+from netdesign.search.state import State
+
+LIMITED_DATUM = "fixed: the poses are error-free"
+SPARE = 1.5  # networks computed exactly per network kept: some fall to exact rays or to domination
+
+
+def finish(problem: Problem, state: State, progress: Progress = silent) -> Design:
+    """Return the front of a finished (or interrupted) search.
+
+    At most ``search.max_networks`` networks, spread over all sizes; f1 falls and f2 rises strictly along each size, and
+    no network dominates another.
+
+    Raises:
+        InfeasibleError: nothing feasible was found; the message names the constraint that binds.
+    """
+    task = problem.task
+    members = state.archive.members
+    if len(members) == 0:
+        raise InfeasibleError(why_infeasible(problem, state))
+    rows = non_dominated(members.objectives)
+    most = task.study.search.max_networks
+    rows = rows[spread(members.objectives[rows], int(np.ceil(SPARE * most)))]
+    exact = Exact(problem)
+    networks: list[DesignedNetwork] = []
+    dropped: Counter[str] = Counter()
+    for number, row in enumerate(rows.tolist()):
+        progress("exact networks", number, len(rows))
+        found = exact.network(members.genes[row][members.bits[row]])
+        if isinstance(found, str):
+            dropped[found] += 1
+        else:
+            networks.append(found)
+    progress("exact networks", len(rows), len(rows))
+    if not networks:
+        raise InfeasibleError("no network of the search survived the exact check: " + _counts(dropped))
+    objectives = np.array([[network.f1, network.f2, network.f3] for network in networks])
+    kept = non_dominated(objectives)
+    dropped["dominated once computed exactly"] += len(networks) - len(kept)
+    kept = kept[spread(objectives[kept], most)]
+    kept = kept[np.lexsort((objectives[kept, 0], objectives[kept, 2]))]
+    bounds = lower_bounds(task, sorted({networks[row].f3 for row in kept}), problem.visibility)
+    return Design(
+        networks=tuple(_bounded(networks[row], bounds) for row in kept.tolist()),
+        history=SearchHistory(evaluations=state.evaluations, hypervolume=state.hypervolume),
+        bounds=bounds,
+        notes=tuple(_notes(problem, dropped)),
+    )
+
+
+class Exact:
+    """Scene, robot and sightings prepared once for many networks."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        task = problem.task
+        self.sight = Sight(task.scene, task.camera, task.limits)
+
+    def network(self, viewpoints: Floats) -> DesignedNetwork | str:
+        """Return the network of viewpoints (n, 2) with every number exact, or in a few words why it is inadmissible."""
+        task, limits = self.problem.task, self.problem.task.limits
+        planned = self._planned(viewpoints)
+        if isinstance(planned, str):
+            return planned
+        viewpoints, world_from_cam, tour, warnings = planned
+        if tour.length > self.problem.tables.longest:
+            return "longer tour than requirements.max_tour"
+        visible = self.sight.look(world_from_cam).visible
+        rays = visible.sum(axis=0)
+        if (rays < limits.min_rays).any():
+            return f"a point with fewer than {limits.min_rays} exact rays"
+        if (visible.sum(axis=1) < limits.min_points_per_image).any():
+            return f"an image with fewer than {limits.min_points_per_image} points"
+        limited, total, complaints = predicted(task, world_from_cam, visible, rays)
+        if not np.isfinite(limited.covariance).all():
+            return "a point whose rays are parallel"
+        precision = limited
+        if task.study.objectives.propagation == "total":
+            if total is None:
+                return "not determined in total error propagation"
+            precision = total
+        worst = task.study.objectives.precision == "max_sigma"
+        return DesignedNetwork(
+            viewpoints=viewpoints,
+            world_from_cam=world_from_cam,
+            f1=float(precision.sigma.max()) if worst else precision.mean_variance,
+            f2=tour.length,
+            f3=len(viewpoints),
+            tour=tour,
+            precision=precision,
+            total=total,
+            bound_ratio=None,
+            warnings=(*warnings, *complaints),
+        )
+
+    def _planned(self, viewpoints: Floats) -> tuple[Floats, Floats, Tour, Sequence[str]] | str:
+        """Viewpoints and poses in visiting order, the tour, warnings; or why the robot cannot."""
+        sphere = self.problem.task.sphere
+        task = self.problem.task
+        if self.problem.joint_map is not None:
+            from netdesign.motion.plan import plan as plan_motion
+
+            plan = plan_motion(task.cell, sphere, task.scene.part, viewpoints, task.study.motion, task.study.seed)
+            if plan.tour is None:
+                return f"out of the robot's reach ({'; '.join(sorted(set(plan.refused)))})"
+            return plan.viewpoints, plan.world_from_cam, plan.tour, plan.warnings
+        positions = sphere.cameras(viewpoints)[:, :3, 3]
+        order, _ = open_path(np.linalg.norm(positions[:, None] - positions[None], axis=2), task.study.seed)
+        length = float(np.linalg.norm(np.diff(positions[order], axis=0), axis=1).sum())
+        tour = Tour(order=np.arange(len(order)), length=length, space="workspace")
+        return viewpoints[order], sphere.cameras(viewpoints[order]), tour, ()
+
+
+def predicted(
+    task: Task, world_from_cam: Floats, visible: Bools, rays: Ints
+) -> tuple[PointPrecision, PointPrecision | None, tuple[str, ...]]:
+    """Return (limited, total or None when not determined, what is weak) of poses (n, 4, 4) and sightings (n, m)."""
+    points, intrinsics = task.scene.targets.points, task.camera.intrinsics
+    sigma = sighting_sigma(task.camera, world_from_cam, task.scene.targets)
+    covariance = limited_covariance(world_from_cam, points, intrinsics, visible, sigma)
+    limited = PointPrecision(covariance=covariance, rays=rays, propagation="limited", datum=LIMITED_DATUM)
+    total = total_covariance(world_from_cam, points, intrinsics, visible, sigma)
+    return limited, total.precision if total.determined else None, total.diagnosis
+
+
+def spread(objectives: Floats, most: int) -> Ints:
+    """Return at most ``most`` rows of a front (N, 3), ascending: every size keeps its ends, the rest is spread evenly.
+
+    Sizes share the places in turn, so that a size with few networks keeps all of them; within a size, places go along
+    the staircase at equal steps of log f1 and f2, both scaled to the size's own range.
+    """
+    if len(objectives) <= most:
+        return np.arange(len(objectives))
+    sizes = np.unique(objectives[:, 2])
+    layers = [np.flatnonzero(objectives[:, 2] == size) for size in sizes]
+    places = np.zeros(len(layers), dtype=np.int64)
+    for turn in range(max(len(layer) for layer in layers)):
+        for index, layer in enumerate(layers):
+            if places.sum() < most and len(layer) > turn:
+                places[index] += 1
+    chosen = [layer[_along(objectives[layer], int(places[index]))] for index, layer in enumerate(layers)]
+    return np.sort(np.concatenate(chosen))
+
+
+def _along(objectives: Floats, count: int) -> Ints:
+    """``count`` rows of one staircase, its ends first, then at equal arc lengths."""
+    if count >= len(objectives):
+        return np.arange(len(objectives))
+    if count <= 0:
+        return np.zeros(0, dtype=np.int64)
+    order = np.argsort(objectives[:, 0], kind="stable")
+    curve = np.stack([np.log(objectives[order, 0]), objectives[order, 1]], axis=1)
+    curve = (curve - curve.min(axis=0)) / np.maximum(np.ptp(curve, axis=0), 1e-300)
+    if count == 1:
+        return order[[int(np.argmin((curve**2).sum(axis=1)))]]
+    length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
+    chosen: list[int] = []
+    for goal in np.linspace(0.0, length[-1], count):
+        nearest = np.argsort(np.abs(length - goal), kind="stable")
+        chosen.append(next(row for row in nearest.tolist() if row not in chosen))
+    return order[chosen]
+
+
+def _bounded(network: DesignedNetwork, bounds: dict[int, float]) -> DesignedNetwork:
+    bound = bounds.get(network.f3)
+    if bound is None:
+        return network
+    content = {name: getattr(network, name) for name in network.__dataclass_fields__}
+    return DesignedNetwork(**{**content, "bound_ratio": network.f1 / bound})
+
+
+def _counts(dropped: Counter[str]) -> str:
+    return ", ".join(f"{count} with {reason}" for reason, count in sorted(dropped.items()) if count)
+
+
+def _notes(problem: Problem, dropped: Counter[str]) -> list[str]:
+    notes = []
+    cover = problem.cover
+    if len(cover.viewpoints):
+        proved = "proved" if cover.least == len(cover.viewpoints) else f"at least {cover.least} proved"
+        notes.append(
+            f"set cover: {len(cover.viewpoints)} images see every point {problem.task.limits.min_rays} times;"
+            f" the least number over {cover.candidates} candidate stations ({proved})"
+        )
+    if sum(dropped.values()):
+        notes.append("left out of the front after the exact check: " + _counts(dropped))
+    return notes
+
+
+def why_infeasible(problem: Problem, state: State) -> str:
+    """Return one line that says what the best network of a search without a feasible one still lacks."""
+    task, limits, slots = problem.task, problem.task.limits, problem.chromosomes.slots
+    cover = problem.cover
+    if cover.least > slots:
+        return (
+            f"viewpoints.max_images: over {cover.candidates} candidate stations at least {cover.least} images are"
+            f" needed to see every object point {limits.min_rays} times, allowed are {slots}"
+        )
+    best = int(np.argmin(state.population.violation))
+    viewpoints = state.population.genes[best][state.population.bits[best]]
+    sees = problem.visibility.sure_tags(problem.visibility.cell_of(viewpoints))
+    lacking = sees.sum(axis=0) < limits.min_rays
+    parts = []
+    if lacking.any():
+        parts.append(
+            f"{4 * lacking.sum()} of {problem.tables.point_count} object points have fewer than {limits.min_rays} rays"
+        )
+    poor = (sees.sum(axis=1) < problem.tables.min_tags).sum()
+    if poor:
+        parts.append(f"{poor} of {len(viewpoints)} images see fewer than {limits.min_points_per_image} points")
+    if problem.joint_map is not None:
+        refused = (~problem.joint_map.reachable(viewpoints)).sum()
+        if refused:
+            parts.append(f"{refused} of {len(viewpoints)} stations are out of the robot's reach")
+    if not parts:
+        longest = task.study.requirements.max_tour
+        parts.append(
+            "some points are seen under nearly parallel rays"
+            if longest is None
+            else f"the tour is longer than requirements.max_tour = {longest}"
+        )
+    return f"no admissible network among {state.evaluations[-1]} evaluated; of the nearest one " + ", ".join(parts)

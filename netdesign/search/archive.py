@@ -1,0 +1,87 @@
+"""The archive: the non-dominated networks of every size, thinned so that neighbours differ by at least epsilon.
+
+The last objective is the size; within one size the front is a staircase in the first two. A network of one size stays
+although a smaller one dominates it: it is a stepping stone, and the final front is cut from all sizes at the end.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from netdesign.search.population import Floats, Ints, Population, joined
+
+EPSILON = 0.01
+"""Relative width of a box in either objective; without thinning an archive fills up with near-copies."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Archive:
+    """Feasible members, sorted by size, then by the first objective; each size a strict staircase."""
+
+    members: Population
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    @property
+    def sizes(self) -> Ints:
+        """(N,) the last objective as whole numbers."""
+        return self.members.objectives[:, -1].astype(np.int64)
+
+    def with_rows(self, candidates: Population) -> "Archive":
+        """Return the archive after the feasible candidates have been offered to it."""
+        everything = joined([self.members, candidates.feasible])
+        return Archive(members=everything.take(staircases(everything.objectives, EPSILON)))
+
+
+def empty_archive(slots: int, genes: int, objectives: int) -> Archive:
+    """Return an archive without members, for chromosomes of that shape."""
+    return Archive(
+        members=Population(
+            bits=np.zeros((0, slots), dtype=np.bool_),
+            genes=np.zeros((0, slots, genes)),
+            objectives=np.zeros((0, objectives)),
+            violation=np.zeros(0),
+        )
+    )
+
+
+def staircases(objectives: Floats, epsilon: float) -> Ints:
+    """Return the rows to keep of objectives (N, 3): for each size the non-dominated ones, thinned, sorted.
+
+    Both ends of a staircase stay. Of the rows that fall into one box of relative width ``epsilon`` the one nearest to
+    the origin in logarithms stays; ties go to the earlier row, so that the result depends on the order of arrival only.
+    """
+    if len(objectives) == 0:
+        return np.zeros(0, dtype=np.int64)
+    logs = np.log(np.maximum(objectives[:, :2], 1e-300))
+    order = np.lexsort((objectives[:, 1], objectives[:, 0], objectives[:, 2]))
+    size, second = objectives[order, 2], objectives[order, 1]
+    starts = np.r_[True, size[1:] != size[:-1]]
+    layer = np.cumsum(starts) - 1
+    keep = np.ones(len(order), dtype=np.bool_)
+    for first, last in zip(np.flatnonzero(starts), np.r_[np.flatnonzero(starts)[1:], len(order)], strict=True):
+        lowest = np.minimum.accumulate(second[first:last])
+        keep[first + 1 : last] = second[first + 1 : last] < lowest[:-1]
+    order, layer = order[keep], layer[keep]
+    if epsilon <= 0:
+        return order
+    boxes = np.floor(logs[order] / np.log1p(epsilon)).astype(np.int64)
+    nearness = logs[order].sum(axis=1)
+    same = np.r_[False, (layer[1:] == layer[:-1]) & (boxes[1:] == boxes[:-1]).all(axis=1)]
+    box = np.cumsum(~same) - 1
+    best = np.lexsort((np.arange(len(order)), nearness, box))
+    chosen = np.zeros(len(order), dtype=np.bool_)
+    chosen[best[np.r_[True, box[best][1:] != box[best][:-1]]]] = True
+    chosen |= np.r_[True, layer[1:] != layer[:-1]] | np.r_[layer[1:] != layer[:-1], True]
+    return order[chosen]
+
+
+def non_dominated(objectives: Floats) -> Ints:
+    """Return the rows (sorted by index) of objectives (N, 3) that no other row dominates; of equal rows the first."""
+    order = np.lexsort((objectives[:, 1], objectives[:, 0], objectives[:, 2]))
+    kept: list[int] = []
+    for row in order.tolist():
+        if not (objectives[kept] <= objectives[row]).all(axis=1).any():
+            kept.append(row)
+    return np.array(sorted(kept), dtype=np.int64)

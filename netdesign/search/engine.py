@@ -1,0 +1,129 @@
+"""The engines: NSGA-II as in the source paper, and the memetic search that is the default.
+
+Both count their budget in evaluations, population x generations, and draw every random number from one generator
+outside the evaluation: a seed gives one result, whatever the number of threads and however often it was stopped.
+
+* ``nsga2``: tournaments, uniform and SBX crossover, bit-flip and polynomial mutation, elitist survival.
+* ``memetic``: starts from seeds (set cover), spends a fifth of the generations (at most 60) on NSGA-II with operators
+  that know what a gene means, then improves members of the archive one gene at a time until the budget is used.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Literal
+
+import moocore
+import numpy as np
+
+from netdesign.errors import InputError
+from netdesign.search.archive import empty_archive
+from netdesign.search.population import Floats, Ints, Population, SearchProblem, Vary, evaluated, joined
+from netdesign.search.selection import constrained_ranks, crowding, survive, tournament
+from netdesign.search.state import State, generator_state, restored_generator
+
+Engine = Literal["memetic", "nsga2"]
+
+GENETIC_SHARE, GENETIC_MOST = 0.2, 60
+BATCH = 16  # members improved between two updates of the archive
+
+OnStep = Callable[[State], None]
+
+
+def run(
+    problem: SearchProblem, engine: Engine, population: int, generations: int, seed: int,
+    resume: State | None = None, on_step: OnStep | None = None,
+) -> State:  # fmt: skip
+    """Search until population x generations networks have been evaluated; return the last state.
+
+    Args:
+        problem: what is searched.  engine: which of the two.
+        population: chromosomes per generation.  generations: with it, the budget.
+        seed: of all random numbers.
+        resume: the state to go on from; it must come from a search with the same arguments.
+        on_step: called with the state after every step; it may save it, and raising stops the search.
+    """
+    if population < 4 or population % 2:
+        population += population % 2 + max(0, 4 - population)
+    state = resume or start(problem, engine, population, seed)
+    if resume is None and on_step:
+        on_step(state)
+    for following in steps(problem, engine, state, population, generations):
+        state = following
+        if on_step:
+            on_step(state)
+    return state
+
+
+def start(problem: SearchProblem, engine: Engine, population: int, seed: int) -> State:
+    """Return the state after the first generation: random chromosomes, and seeds if the engine wants them."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    bits, genes = problem.random(rng, population)
+    if engine == "memetic":
+        seed_bits, seed_genes = problem.seeds()
+        count = min(len(seed_bits), population // 2)
+        bits = np.concatenate([seed_bits[:count], bits[count:]])
+        genes = np.concatenate([seed_genes[:count], genes[count:]])
+    elif engine != "nsga2":
+        raise InputError(f"engine: expected memetic or nsga2, found {engine}")
+    first = evaluated(problem.evaluate, bits, genes)
+    archive = empty_archive(bits.shape[1], genes.shape[2], first.objectives.shape[1]).with_rows(first)
+    empty = State(
+        step=0, population=first, archive=archive, evaluations=np.zeros(0, np.int64), hypervolume=np.zeros(0), random=""
+    )
+    return _noted(problem, empty, rng, len(first))
+
+
+def steps(problem: SearchProblem, engine: Engine, state: State, population: int, generations: int) -> Iterator[State]:
+    """Yield the states after every further step until the budget is used."""
+    rng = restored_generator(state.random)
+    budget = population * generations
+    genetic = generations if engine == "nsga2" else min(GENETIC_MOST, max(1, round(GENETIC_SHARE * generations)))
+    vary = problem.vary_plain if engine == "nsga2" else problem.vary_structured
+    while state.evaluations[-1] < budget:
+        # Without a feasible network there is nothing to improve: go on breeding.
+        if state.step < genetic or len(state.archive) == 0:
+            children = offspring(rng, problem, state.population, vary)
+            survivors = survive(joined([state.population, children]), population)[0]
+            state = replace(state, population=survivors, archive=state.archive.with_rows(children))
+        else:
+            children = problem.improve(rng, _picks(rng, state))
+            state = replace(state, archive=state.archive.with_rows(children))
+        state = _noted(problem, replace(state, step=state.step + 1), rng, len(children))
+        yield state
+
+
+def offspring(rng: np.random.Generator, problem: SearchProblem, population: Population, vary: Vary) -> Population:
+    """Return as many evaluated children as there are parents."""
+    ranks = constrained_ranks(population.objectives, population.violation)
+    readable = np.where((population.violation <= 0)[:, None], population.objectives, 0.0)
+    parents = tournament(rng, ranks, crowding(readable, ranks), len(population) + len(population) % 2)
+    half = len(parents) // 2
+    bits, genes = vary(rng, population.take(parents[:half]), population.take(parents[half:]))
+    return evaluated(problem.evaluate, bits, genes)
+
+
+def _picks(rng: np.random.Generator, state: State) -> Population:
+    """Members for the local search: a size at random, then one of its members, so that no size is neglected."""
+    sizes: Ints = state.archive.sizes
+    different, starts, counts = np.unique(sizes, return_index=True, return_counts=True)
+    layer = rng.integers(0, len(different), BATCH)
+    rows = starts[layer] + np.floor(rng.random(BATCH) * counts[layer]).astype(np.int64)
+    return state.archive.members.take(rows)
+
+
+def _noted(problem: SearchProblem, state: State, rng: np.random.Generator, spent: int) -> State:
+    """The state with one more line of history and the generator's state."""
+    before = int(state.evaluations[-1]) if len(state.evaluations) else 0
+    return replace(
+        state,
+        evaluations=np.append(state.evaluations, before + spent),
+        hypervolume=np.append(state.hypervolume, hypervolume(problem, state.archive.members.objectives)),
+        random=generator_state(rng),
+    )
+
+
+def hypervolume(problem: SearchProblem, objectives: Floats) -> float:
+    """Return the hypervolume of feasible objectives (N, q), normalised to [0, 1] by the problem's scales."""
+    scaled = np.maximum(problem.normalise(objectives), 0.0) if len(objectives) else objectives
+    scaled = scaled[(scaled < 1.0).all(axis=1)]
+    return float(moocore.hypervolume(scaled, ref=1.0)) if len(scaled) else 0.0

@@ -1,0 +1,60 @@
+"""NSGA-II's selection: constrained non-dominated sorting, crowding, elitist survival, tournaments.
+
+Source: K. Deb, S. Agrawal, A. Pratap, T. Meyarivan, PPSN VI, 2000, with constrained domination of IEEE TEVC 6(2), 2002:
+feasible before infeasible, feasible by domination, infeasible by violation.
+"""
+
+import moocore
+import numpy as np
+
+from netdesign.search.population import Floats, Ints, Population
+
+
+def constrained_ranks(objectives: Floats, violation: Floats) -> Ints:
+    """Return the front (P,) of every row, 0 the best; equal violations share a front behind all feasible ones."""
+    ranks = np.zeros(len(objectives), dtype=np.int64)
+    feasible = violation <= 0
+    fronts = 0
+    if feasible.any():
+        ranks[feasible] = moocore.pareto_rank(objectives[feasible])
+        fronts = int(ranks[feasible].max()) + 1
+    if not feasible.all():
+        ranks[~feasible] = fronts + np.unique(violation[~feasible], return_inverse=True)[1]
+    return ranks
+
+
+def crowding(objectives: Floats, ranks: Ints) -> Floats:
+    """Return the crowding distance (P,) of every row within its front; inf at the ends of each objective."""
+    count = len(objectives)
+    distance = np.zeros(count)
+    for values in objectives.T:
+        order = np.lexsort((values, ranks))
+        ordered, front = values[order], ranks[order]
+        starts = np.r_[True, front[1:] != front[:-1]]
+        ends = np.r_[starts[1:], True]
+        extent = (ordered[np.flatnonzero(ends)] - ordered[np.flatnonzero(starts)])[np.cumsum(starts) - 1]
+        gap = np.zeros(count)
+        gap[1:-1] = ordered[2:] - ordered[:-2]
+        step = np.where(extent > 0, gap / np.where(extent > 0, extent, 1.0), 0.0)
+        distance[order] += np.where(starts | ends, np.inf, step)
+    return distance
+
+
+def survive(population: Population, size: int) -> tuple[Population, Ints, Floats]:
+    """Return the best ``size`` rows by front, then crowding, with their ranks and crowding distances."""
+    ranks = constrained_ranks(population.objectives, population.violation)
+    # Infeasible rows are ordered by violation alone: their objectives mean nothing.
+    readable = np.where((population.violation <= 0)[:, None], population.objectives, 0.0)
+    distance = crowding(readable, ranks)
+    chosen = np.lexsort((-distance, ranks))[:size]
+    return population.take(chosen), ranks[chosen], distance[chosen]
+
+
+def tournament(rng: np.random.Generator, ranks: Ints, distance: Floats, count: int) -> Ints:
+    """Return ``count`` winners of binary tournaments: lower front, then larger crowding distance, then chance."""
+    pairs = rng.integers(0, len(ranks), (count, 2))
+    coin = rng.random(count) < 0.5
+    one, two = pairs[:, 0], pairs[:, 1]
+    better = (ranks[one] < ranks[two]) | ((ranks[one] == ranks[two]) & (distance[one] > distance[two]))
+    worse = (ranks[two] < ranks[one]) | ((ranks[one] == ranks[two]) & (distance[two] > distance[one]))
+    return np.where(better | (~worse & coin), one, two)

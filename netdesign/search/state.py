@@ -1,0 +1,101 @@
+"""The whole state of a search between two steps, and its file: a killed search resumes to the same result."""
+
+import json
+import os
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+
+import numpy as np
+
+from netdesign.errors import InputError
+from netdesign.search.archive import Archive
+from netdesign.search.population import Floats, Ints, Population
+
+VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """Everything the rest of a search depends on.
+
+    Attributes:
+        step: generations done, those of the local search included.
+        population: the current generation.  archive: the best of every size so far.
+        evaluations, hypervolume: (h,) history, one entry per step.
+        random: state of the random numbers, JSON.
+    """
+
+    step: int
+    population: Population
+    archive: Archive
+    evaluations: Ints
+    hypervolume: Floats
+    random: str
+
+
+def generator_state(rng: np.random.Generator) -> str:
+    """Return the generator's state as JSON."""
+    return json.dumps(rng.bit_generator.state)
+
+
+def restored_generator(state: str) -> np.random.Generator:
+    """Return a generator that goes on where ``state`` was taken."""
+    rng = np.random.Generator(np.random.PCG64())
+    rng.bit_generator.state = json.loads(state)
+    return rng
+
+
+def save(path: Path, state: State, key: str) -> None:
+    """Write the state beside its place, then rename: the file is always whole.
+
+    Args:
+        path: .npz.
+        key: identifies the search (study, seed, settings); :func:`load` asks for the same.
+    """
+    arrays: dict[str, np.ndarray] = {
+        "version": np.array(VERSION),
+        "key": np.array(key),
+        "step": np.array(state.step),
+        "evaluations": state.evaluations,
+        "hypervolume": state.hypervolume,
+        "random": np.array(state.random),
+    }
+    for prefix, population in (("population", state.population), ("archive", state.archive.members)):
+        for field in fields(population):
+            arrays[f"{prefix}_{field.name}"] = getattr(population, field.name)
+    scratch = NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}-", delete=False)
+    try:
+        with scratch:
+            np.savez(scratch, **arrays)  # type: ignore[arg-type]
+        os.replace(scratch.name, path)
+    except BaseException:
+        Path(scratch.name).unlink(missing_ok=True)
+        raise
+
+
+def load(path: Path, key: str) -> State:
+    """Return the state of a search.
+
+    Raises:
+        InputError: the file cannot be read, or belongs to another search.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            if int(stored["version"]) != VERSION or str(stored["key"]) != key:
+                raise InputError(f"{path}: this checkpoint belongs to another study, seed or version; delete it")
+            populations = [
+                Population(**{field.name: stored[f"{prefix}_{field.name}"] for field in fields(Population)})
+                for prefix in ("population", "archive")
+            ]
+            return State(
+                step=int(stored["step"]),
+                population=populations[0],
+                archive=Archive(members=populations[1]),
+                evaluations=stored["evaluations"],
+                hypervolume=stored["hypervolume"],
+                random=str(stored["random"]),
+            )
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as problem:
+        raise InputError(f"{path}: not a readable checkpoint ({problem}); delete it") from problem

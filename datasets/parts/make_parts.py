@@ -9,6 +9,7 @@ detector needs, so a tag takes a square of 25 mm.
 """
 
 import argparse
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -121,7 +122,7 @@ def bracket():
         return np.array([x, y, z]) + origin
 
     faces = []
-    for k, (start, end) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
+    for k, (start, end) in enumerate(pairwise(cuts)):
         letters = "OBDPQEF" if k % 2 else "OBDPCQEF"  # every second stretch is a rib
         for a, b in zip(letters, letters[1:] + letters[0], strict=True):
             faces.append(np.array([at(a, start), at(a, end), at(b, end), at(b, start)]))
@@ -133,11 +134,11 @@ def bracket():
     faces += ribs
 
     wide = cuts[-1]
-    places = [rib for rib in ribs]
-    places += [np.array([at("P", y0), at("D", y0), at("D", y1), at("P", y1)]) for y0, y1 in [(0, wide)]]
-    places += [np.array([at("E", y0), at("Q", y0), at("Q", y1), at("E", y1)]) for y0, y1 in [(0, wide)]]
-    places += [np.array([at("O", 0), at("F", 0), at("F", wide), at("O", wide)])]
-    for k, (y0, y1) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
+    places = [*ribs]
+    for a, b in ("PD", "EQ"):
+        places.append(np.array([at(a, 0), at(b, 0), at(b, wide), at(a, wide)]))
+    places.append(np.array([at("O", 0), at("F", 0), at("F", wide), at("O", wide)]))
+    for k, (y0, y1) in enumerate(pairwise(cuts)):
         if k % 2:
             places.append(np.array([at("Q", y0), at("P", y0), at("P", y1), at("Q", y1)]))
         else:

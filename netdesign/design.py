@@ -1,0 +1,107 @@
+"""The verb ``design``: from a study file to the Pareto front of camera networks, RUN/design.json.
+
+Read the study, build the search problem, search, finish the front with exact values, write it. The search can be
+interrupted at any moment and resumed to the same bytes.
+"""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numba
+
+from netdesign.files.design_json import read_networks, write_design
+from netdesign.files.study import load_task, resolve
+from netdesign.model.progress import Progress, silent
+from netdesign.model.results import Design
+from netdesign.model.task import Task
+from netdesign.placement.finish import finish
+from netdesign.placement.problem import Problem
+from netdesign.run_folder import run_folder, start_run
+from netdesign.search.engine import run as search
+from netdesign.search.state import State
+from netdesign.search.state import load as load_state
+from netdesign.search.state import save as save_state
+
+CHECKPOINT = "checkpoint.npz"
+SECONDS_BETWEEN_CHECKPOINTS = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class DesignOutcome:
+    """Where the front is, and what to print."""
+
+    run: Path
+    summary: str
+
+
+def design_study(
+    study: Path, output: Path | None, *, seed: int | None, resume: bool, threads: int, progress: Progress = silent
+) -> DesignOutcome:
+    """Search the Pareto front of a study and write RUN/design.json.
+
+    Args:
+        output: run directory, None for runs/<name>.  seed: instead of the study's.
+        resume: go on from RUN/checkpoint.npz; the result is the one of an uninterrupted search.
+        threads: of the kernels; the result does not depend on it.
+
+    Raises:
+        InputError: the study is wrong, or the run directory holds another one.
+        InfeasibleError: no admissible network; the message names the binding constraint with counts.
+    """
+    task = load_task(study, seed)
+    resolved = resolve(study, seed)
+    run = run_folder(resolved, output)
+    if resume and (run / "design.json").is_file() and not (run / CHECKPOINT).is_file():
+        count = len(read_networks(run))
+        return DesignOutcome(run=run, summary=f"{run}/design.json: {count} networks, finished before")
+    numba.set_num_threads(max(1, min(threads, numba.config.NUMBA_NUM_THREADS)))
+    problem = Problem.build(task, progress)
+    start_run(resolved, run)  # nothing is written before the study has turned out to be feasible
+    state = _searched(task, problem, run / CHECKPOINT, resume, progress)
+    design = finish(problem, state, progress)
+    write_design(run / "design.json", task, design)
+    (run / CHECKPOINT).unlink(missing_ok=True)
+    return DesignOutcome(run=run, summary=_summary(task, run, design, int(state.evaluations[-1])))
+
+
+def _searched(task: Task, problem: Problem, checkpoint: Path, resume: bool, progress: Progress) -> State:
+    """Return the finished state of the search; every few seconds, and when interrupted, it is kept on disk."""
+    settings = task.study.search
+    budget = settings.population * settings.generations
+    latest = load_state(checkpoint, task.sha256) if resume and checkpoint.is_file() else None
+    start, last_saved = latest, time.monotonic()
+
+    def on_step(state: State) -> None:
+        nonlocal latest, last_saved
+        latest = state
+        done = min(int(state.evaluations[-1]), budget)
+        progress("search", done, budget, f"hypervolume {state.hypervolume[-1]:.4f}")
+        if time.monotonic() - last_saved > SECONDS_BETWEEN_CHECKPOINTS:
+            save_state(checkpoint, state, task.sha256)
+            last_saved = time.monotonic()
+
+    try:
+        return search(
+            problem, settings.engine, settings.population, settings.generations, task.study.seed,
+            resume=start, on_step=on_step,
+        )  # fmt: skip
+    except KeyboardInterrupt:
+        if latest is not None:
+            save_state(checkpoint, latest, task.sha256)
+        raise
+
+
+def _summary(task: Task, run: Path, design: Design, evaluations: int) -> str:
+    """Return what the front holds, a line for each number of images."""
+    unit, scale = {"workspace": ("mm", 1e3), "joint": ("rad", 1.0), "time": ("s", 1.0)}[task.study.motion]
+    lines = [f"{run}/design.json: {len(design.networks)} networks after {evaluations} evaluations"]
+    for size in sorted({network.f3 for network in design.networks}):
+        layer = [network for network in design.networks if network.f3 == size]
+        sigma = [1e6 * network.precision.mean_variance**0.5 for network in layer]
+        tour = [scale * network.f2 for network in layer]
+        lines.append(
+            f"  {size:2d} images: {len(layer)} networks, rms sigma {min(sigma):.2f} to {max(sigma):.2f} um, "
+            f"tour {min(tour):.4g} to {max(tour):.4g} {unit}"
+        )
+    return "\n".join([*lines, *design.notes])

@@ -1,0 +1,180 @@
+"""One planned network against reality: photographed, measured, adjusted, compared.
+
+The stations are executed as a robot would (nominal pose plus a seeded error), the tags rendered, detected and fitted,
+the bundle adjusted from nominal values with GTSAM. A failure at any step is kept with its reason.
+"""
+
+import hashlib
+from concurrent.futures import Executor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from netdesign.adjustment.bundle import adjust
+from netdesign.adjustment.compare import compare
+from netdesign.adjustment.estimate import estimate
+from netdesign.adjustment.problem import BundleProblem
+from netdesign.errors import EnvironmentProblem, InputError, NetdesignError
+from netdesign.files.adjustment import adjustment_payload, validation_payload
+from netdesign.files.design_json import PlannedNetwork
+from netdesign.files.store import read_json, write_json, write_text
+from netdesign.imageset import image_name, measure_images, observations_of, render_images
+from netdesign.imaging.measure import Gates
+from netdesign.imaging.photograph import RendererName, Shoot
+from netdesign.model.adjustment import Adjustment
+from netdesign.model.arrays import Floats
+from netdesign.model.frames import exp_rotation, pose
+from netdesign.model.network import Observations
+from netdesign.model.progress import Progress, silent
+from netdesign.model.results import PointPrecision
+from netdesign.model.task import Task
+from netdesign.photogrammetry.limited_error import limited_covariance
+from netdesign.photogrammetry.precision import sighting_sigma
+from netdesign.photogrammetry.total_error import total_covariance
+from netdesign.photogrammetry.visibility import sightings
+
+CELLS = 8  # of a tag36h11's black square along an edge
+OUTLIER_SIGNIFICANCE = 1e-4  # data snooping at 1e-3 would bias s0² by 0.7 %
+
+
+def executed_poses(task: Task, network: PlannedNetwork, repeat: int = 0) -> Floats:
+    """Return where the camera really stood, (n, 4, 4) m: the plan plus a robot's error, drawn from the study's seed."""
+    settings, count = task.study.validation, len(network.world_from_cam)
+    random = np.random.default_rng([task.study.seed, network.id, repeat])
+    shift = random.normal(scale=settings.pose_jitter_mm * 1e-3, size=(count, 3))
+    turn = random.normal(scale=settings.pose_jitter_mrad * 1e-3, size=(count, 3))
+    error: Floats = network.world_from_cam @ pose(exp_rotation(turn), shift)
+    return error
+
+
+def photograph(
+    task: Task,
+    network: PlannedNetwork,
+    out: Path,
+    repeat: int,
+    executor: Executor | None,
+    progress: Progress = silent,
+    renderer: RendererName = "pyrender",
+) -> list[Path]:
+    """Render what the camera sees from the executed poses; the noise seed belongs to network and repeat."""
+    seed = int(np.random.SeedSequence([task.study.seed, network.id, repeat]).generate_state(1)[0])
+    shoot = Shoot(seed=seed, supersample=task.study.validation.supersample, renderer=renderer)
+    poses = executed_poses(task, network, repeat)
+    return render_images(
+        task.scene, task.camera, task.limits, poses, out, shoot,
+        executor=executor, progress=progress, study_sha256=task.sha256,
+    )  # fmt: skip
+
+
+def prove_network(
+    task: Task, network: PlannedNetwork, folder: Path, repeat: int, level: float, executor: Executor | None
+) -> None:
+    """Write a network's images, observations.csv, adjustment.json and validation.json; a failure keeps its reason."""
+    (folder / "adjustment.json").unlink(missing_ok=True)
+    names = [image_name(index) for index in range(len(network.world_from_cam))]
+    point_ids = task.scene.targets.point_ids
+    paths = photograph(task, network, folder, repeat, executor)
+    measured = measure_images(paths, task.camera, task.scene.targets, gates=_gates(task), executor=executor)
+    observations, _, unused = observations_of(measured, task.scene.targets)
+    write_text(folder / "observations.csv", observations_csv(observations, names, point_ids))
+    record: dict[str, Any] = {
+        "network": network.id,
+        "repeat": repeat,
+        "plan": _plan_key(network),
+        "tags_not_used": unused,
+        "image_points": len(observations),
+    }
+    try:
+        adjustment = _adjusted(task, network, observations, names)
+        limited, total = predictions(task, network)
+        validation = compare(task.scene.targets.points, adjustment, limited, total, level, seed=task.study.seed)
+    except EnvironmentProblem:
+        raise
+    except NetdesignError as error:
+        record |= {"verdict": "failed", "passed": False, "reasons": [str(error)], "warnings": []}
+    else:
+        record |= validation_payload(validation, point_ids)
+        record["verdict"] = "pass" if validation.passed else "fail"
+        record["rejected_image_points"] = len(adjustment.rejected)
+        write_json(
+            folder / "adjustment.json", "adjustment", adjustment_payload(adjustment, names, point_ids), task.sha256
+        )
+    write_json(folder / "validation.json", "network-validation", record, task.sha256)
+
+
+def predictions(task: Task, network: PlannedNetwork) -> tuple[PointPrecision, PointPrecision]:
+    """Return what the design promises: P0, limited, and P1, total error propagation at the planned stations."""
+    poses, points = network.world_from_cam, task.scene.targets.points
+    visible = sightings(task.scene, task.camera, poses, task.limits).visible
+    sigma = sighting_sigma(task.camera, poses, task.scene.targets)
+    limited = PointPrecision(
+        covariance=limited_covariance(poses, points, task.camera.intrinsics, visible, sigma),
+        rays=visible.sum(axis=0),
+        propagation="limited",
+        datum="exterior orientation error-free",
+    )
+    return limited, total_covariance(poses, points, task.camera.intrinsics, visible, sigma).precision
+
+
+def is_proved(task: Task, network: PlannedNetwork, folder: Path) -> bool:
+    """Whether the network was validated for this study and these stations."""
+    if not (folder / "validation.json").is_file():
+        return False
+    try:
+        record = read_json(folder / "validation.json", "network-validation")
+    except InputError:
+        return False
+    return bool(record.get("study_sha256") == task.sha256 and record.get("plan") == _plan_key(network))
+
+
+def observations_csv(observations: Observations, names: list[str], point_ids: tuple[str, ...]) -> str:
+    """Return observations.csv: one measured corner a line."""
+    lines = ["image,tag,corner,x_px,y_px,sxx_px2,sxy_px2,syy_px2"]
+    for i, j, (x, y), s in zip(
+        observations.image, observations.point, observations.xy_px, observations.covariance, strict=True
+    ):
+        tag, corner = point_ids[j].split(".")
+        values = ",".join(repr(float(value)) for value in (x, y, s[0, 0], s[0, 1], s[1, 1]))
+        lines.append(f"{names[i]},{tag},{corner},{values}")
+    return "\n".join(lines) + "\n"
+
+
+def _adjusted(task: Task, network: PlannedNetwork, observations: Observations, names: list[str]) -> Adjustment:
+    """Return the free adjustment from nominal values: gross errors out first, then GTSAM on what is left."""
+    start = BundleProblem(
+        observations=observations,
+        camera_of_image=np.zeros(len(names), dtype=np.int64),
+        intrinsics=task.camera.intrinsics[None],
+        world_from_cam=network.world_from_cam,
+        points=task.scene.targets.points,
+        image_names=names,
+        point_names=task.scene.targets.point_ids,
+    )
+    cleaned = estimate(start, robust=True, significance=OUTLIER_SIGNIFICANCE)
+    adjustment = adjust(
+        cleaned.observations,
+        task.camera,
+        network.world_from_cam,
+        task.scene.targets.points,
+        image_names=names,
+        point_names=task.scene.targets.point_ids,
+    )
+    return replace(adjustment, rejected=cleaned.rejected)
+
+
+def _gates(task: Task) -> Gates:
+    """Return the gates of the measurement: a tag that the design does not count on is not used either."""
+    usual, limits = Gates(), task.limits
+    return replace(
+        usual,
+        max_incidence=min(usual.max_incidence, limits.max_incidence),
+        min_cell_px=max(usual.min_cell_px, limits.min_tag_px / CELLS),
+        border_px=max(usual.border_px, limits.border_px),
+    )
+
+
+def _plan_key(network: PlannedNetwork) -> str:
+    """Return what identifies a plan: a validation of other stations is stale."""
+    return hashlib.sha256(np.round(network.world_from_cam, 12).tobytes()).hexdigest()

@@ -248,6 +248,6 @@ def _statement(count: int, rho: Band, root_f: Band) -> str:
         for band in (rho, root_f)
     ]
     return (
-        f"Over {count} realisation(s) the predicted accuracy {verdict} shown to be the achieved one. With 90 % intervals: "
-        f"achieved / predicted {bands[0]}; geometry alone, sqrt(F), {bands[1]}."
+        f"Over {count} realisation(s) the predicted accuracy {verdict} shown to be the achieved one. "
+        f"With 90 % intervals: achieved / predicted {bands[0]}; geometry alone, sqrt(F), {bands[1]}."
     )

@@ -19,6 +19,7 @@ from netdesign.photogrammetry.observation_equations import Layout, linearise, wh
 
 CAUCHY = 2.3849
 MOST_ITERATIONS = 200
+CLOSE = 1e-3  # length of a step, in standard deviations, from which on the cost no longer judges it
 STEP = 1e-7  # length of the last Gauss-Newton step, in standard deviations of all unknowns together
 
 
@@ -164,7 +165,7 @@ def solve(problem: BundleProblem, robust: bool = False) -> Solution:
     whiten = whitener(problem.observations.covariance)
     squared, extra, _ = cost_parts(problem, whiten)
     cost, damping, decrement = _total(squared, extra, robust), 1e-6, np.inf
-    stalled = 0
+    polished = 0
     for iteration in range(1, MOST_ITERATIONS + 1):
         weights = np.sqrt(robust_weights(squared)) if robust else np.ones(len(squared))
         linearised, rows = equations(problem, layout, whiten * weights[:, None, None])
@@ -173,18 +174,20 @@ def solve(problem: BundleProblem, robust: bool = False) -> Solution:
         new_squared, new_extra, depth = cost_parts(candidate, whiten)
         new_cost = _total(new_squared, new_extra, robust)
         misclosed = len(rows) > 0 and np.abs(rows[:, -1]).max() > 1e-12
-        # A heavily damped step is short whatever the distance to the minimum.
-        small = decrement < STEP * (1e3 if robust else 1.0) and damping <= 1e-2 and not misclosed
-        if (depth > 0).all() and (new_cost <= cost * (1 + 1e-13) or misclosed):
-            problem, squared = candidate, new_squared
-            stalled = stalled + 1 if new_cost > cost * (1 - 1e-14) else 0
-            cost, extra = new_cost, new_extra
+        if decrement < CLOSE and not misclosed:
+            # So close the change of the cost drowns in rounding: plain Gauss-Newton steps, judged by their length.
+            if damping > 1e-2:
+                damping = 0.0  # a heavily damped step is short whatever the distance to the minimum: look again
+                continue
+            problem, squared, cost, extra = candidate, new_squared, new_cost, new_extra
+            polished += 1
+            if decrement < STEP * (1e3 if robust else 1.0) or polished >= 10:
+                return solution_at(problem, iteration)
+        elif (depth > 0).all() and (new_cost <= cost or misclosed):
+            problem, squared, cost, extra = candidate, new_squared, new_cost, new_extra
             damping = damping * 0.1 if damping > 1e-9 else 0.0
-        elif not small:
-            stalled = 0
+        else:
             damping = max(damping * 10.0, 1e-6)
-        if small or (stalled >= 3 and decrement < 1e-3):
-            return solution_at(problem, iteration)
         if damping > 1e12:
             break
     raise InfeasibleError(

@@ -5,6 +5,8 @@ line of its axis (direction and offset); a long link is cut across into slabs wh
 smaller than one.
 """
 
+import itertools
+
 import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
@@ -47,7 +49,7 @@ def _slabs(triangles: Floats, axis: Floats, count: int) -> list[Floats]:
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     start, end = edges[:, 0] @ axis, edges[:, 1] @ axis
     slabs = []
-    for low, high in zip(cuts[:-1], cuts[1:], strict=True):
+    for low, high in itertools.pairwise(cuts.tolist()):
         inside = triangles.reshape(-1, 3)[((height >= low - 1e-9) & (height <= high + 1e-9)).reshape(-1)]
         pieces = [inside]
         for cut in (low, high):

@@ -39,9 +39,9 @@ class Body(NamedTuple):
     placements (r, 4, 4) and last_from_cam (4, 4): the chain from the world to the camera.
     capsules (c, 7) in the frame of capsule_link (c,), 0 the base: both ends and the radius; the last `camera_parts` of
     them belong to the camera. pairs (s, 2): capsules that are tested against each other.
-    boxes (b, 6): centre and half edge lengths; mounting (b,): the base stands on it, so link 1 is not tested against it.
-    field (x, y, z): lower bound of the distance to the part at the centre
-    of each cell; field_origin (3,): centre of cell 0; field_step: edge of a cell.
+    boxes (b, 6): centre and half edge lengths; mounting (b,): the base stands on it, so link 1 is not tested against
+    it. field (x, y, z): lower bound of the distance to the part at the centre of each cell; field_origin (3,): centre
+    of cell 0; field_step: edge of a cell.
     margin: kept from part and obstacles. sight (k, 2): share of the way from camera to centre, radius that must be
     clear there; centre (3,): what the camera looks at.
     """
@@ -135,7 +135,7 @@ def _field_distance(field, origin, step, x, y, z):  # type: ignore[no-untyped-de
         last = field.shape[a] - 1
         beyond = max(-cell, cell - last, 0.0)
         outside += (beyond * step) ** 2
-        index[a] = int(math.floor(min(max(cell, 0.0), float(last)) + 0.5))
+        index[a] = math.floor(min(max(cell, 0.0), float(last)) + 0.5)
     if outside > 0.0:
         return math.sqrt(outside) + 0.5 * _FIELD_PAD
     return field[index[0], index[1], index[2]]
@@ -243,7 +243,7 @@ def leg_state(body, start, end, step):  # type: ignore[no-untyped-def]
     widest = 0.0
     for i in range(r):
         widest = max(widest, abs(end[i] - start[i]))
-    count = int(math.ceil(widest / step)) + 1
+    count = math.ceil(widest / step) + 1
     q = np.empty(r)
     for k in range(count + 1):
         for i in range(r):

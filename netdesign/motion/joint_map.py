@@ -90,7 +90,7 @@ class JointMap:
         """Build the map of a loaded arm, see ``build``."""
         follows = sphere.roll is None and arm.coaxial and arm.ur is not None
         count = (rolls or SEARCH_ROLLS) if sphere.roll is None and not follows else 1
-        angles = np.arange(count) * (2.0 * np.pi / count) + (sphere.roll or 0.0)
+        angles: Floats = np.arange(count, dtype=np.float64) * (2.0 * np.pi / count) + (sphere.roll or 0.0)
         sizes = _GRID_CLOSED if arm.ur is not None else _GRID_SHEETS
         size = grid or sizes.get(count, sizes[SEARCH_ROLLS])
         low = max(sphere.elevation[0], -0.5 * np.pi + 0.02)
@@ -110,6 +110,25 @@ class JointMap:
         count = len(viewpoints)
         joints = np.zeros((count, self.arrays.joints.shape[-1], self.arrays.most))
         return joints, np.array([options_at(self.arrays, *viewpoints[i], joints[i]) for i in range(count)])
+
+    @property
+    def rest(self) -> float:
+        """The value in rad of a last joint that never moves (``follows``)."""
+        return _rest(self.arm)
+
+    def near(self, viewpoint: Floats, layer: int) -> list[tuple[int, Floats]]:
+        """Return (branch, joints (r,)) of what exists at the nodes around a viewpoint (2,) in one roll layer."""
+        size = self.arrays.state.shape[1]
+        x, y = (np.array(_disc(viewpoint[None]))[:, 0] / self.arrays.half + 1.0) * 0.5 * (size - 1)
+        found = []
+        corners = [(i, j) for i in (int(x), int(x) + 1) for j in (int(y), int(y) + 1) if max(i, j) < size]
+        corners.sort(key=lambda node: (node[0] - x) ** 2 + (node[1] - y) ** 2)
+        for branch in range(self.arrays.state.shape[3]):
+            for i, j in corners:
+                if self.arrays.state[layer, i, j, branch] != NO_SOLUTION:
+                    found.append((branch, self.arrays.joints[layer, i, j, branch].astype(np.float64)))
+                    break
+        return found
 
     def reachable(self, viewpoints: Floats) -> Bools:
         """Return whether each of viewpoints (n, 2) has a free option."""
@@ -140,6 +159,11 @@ class JointMap:
         alpha = rng.uniform(alpha_low, alpha_high, samples)
         found = self.reasons(np.stack([alpha, beta], axis=1))
         return {reason: found.count(reason) / samples for reason in REASONS}
+
+
+def _rest(arm: ArmCell) -> float:
+    """Return the value of a last joint that never moves: 0, or the nearest its limits allow."""
+    return float(np.clip(0.0, arm.placed.lower[-1], arm.placed.upper[-1]))
 
 
 def _best_state(states: NDArray[np.int8], worst: bool = False) -> int:
@@ -177,24 +201,26 @@ def _fill(arm: ArmCell, targets: Floats, follows: bool) -> Arrays:
     if arm.ur is None:
         solved, found = sheets(arm.placed, targets)
     else:
-        solved = np.zeros((*shape, BRANCHES, 6))
-        found = np.zeros((*shape, BRANCHES), dtype=np.bool_)
-        _solve_closed(arm, targets.reshape(-1, 4, 4), solved.reshape(-1, BRANCHES, 6), found.reshape(-1, BRANCHES))
+        solved, found = solve_closed(arm, targets.reshape(-1, 4, 4))
+        solved, found = solved.reshape(*shape, BRANCHES, 6), found.reshape(*shape, BRANCHES)
     count, r = found.shape[-1], solved.shape[-1]
-    rest = float(np.clip(0.0, arm.placed.lower[-1], arm.placed.upper[-1])) if follows else math.nan
-    state = _states_of(
-        arm.body, arm.placed.lower, arm.placed.upper, solved.reshape(-1, r), found.reshape(-1), rest
-    )  # fmt: skip
+    rest = _rest(arm) if follows else math.nan
+    state = _states_of(arm.body, arm.placed.lower, arm.placed.upper, solved.reshape(-1, r), found.reshape(-1), rest)
     return {"joints": solved.astype(np.float32), "state": state.reshape(*shape, count)}
 
 
-def _solve_closed(arm: ArmCell, targets: Floats, solved: Floats, found: Bools) -> None:
-    """Fill joints (N, 8, 6) and found (N, 8) of targets (N, 4, 4) by the closed form."""
-    assert_ur = arm.ur
-    if assert_ur is not None:
-        _closed(
-            assert_ur.axes, assert_ur.points, assert_ur.wrist, assert_ur.flange_inverse, targets, solved, found
-        )
+def solve_closed(arm: ArmCell, targets: Floats) -> tuple[Floats, Bools]:
+    """Return joints (N, 8, 6) and which exist (N, 8) of targets world_from_cam (N, 4, 4) by the closed form.
+
+    Raises:
+        ValueError: the arm has no closed form.
+    """
+    if arm.ur is None:
+        raise ValueError(f"{arm.chain.name}: expected an arm with a closed form")
+    solved, found = np.zeros((len(targets), BRANCHES, 6)), np.zeros((len(targets), BRANCHES), dtype=np.bool_)
+    geometry = arm.ur
+    _closed(geometry.axes, geometry.points, geometry.wrist, geometry.flange_inverse, targets, solved, found)
+    return solved, found
 
 
 @njit(cache=True, error_model="numpy")

@@ -63,9 +63,7 @@ def sheets(chain: Chain, targets: Floats) -> tuple[Floats, Bools]:
                     targets[tuple(anchor)], q, np.empty((0, len(chain))),
                 ):  # fmt: skip
                     continue
-                if any(
-                    found[tuple(anchor)] and _near(chain, joints[tuple(anchor)], q) for joints, found in kept
-                ):
+                if any(found[tuple(anchor)] and _near(chain, joints[tuple(anchor)], q) for joints, found in kept):
                     continue
                 joints = np.zeros((layers, size, size, len(chain)))
                 found = np.zeros((layers, size, size), dtype=np.bool_)

@@ -10,7 +10,8 @@ A leg costs (law "joint") the weighted norm of the joint differences, or (law "t
 the real ranges. Sources: the source paper's D(V_i, V_j); the scheme is Bellman's dynamic programming.
 
 Kernels: options (n, r, K), count (n,), law (4, r): lambda, 1/speed, 1/acceleration, and 2 pi where the joint wraps
-(else 0); timed: which law.
+(else 0); timed: which law. label (n, K) and barred (n, n, B, B): what a leg from station i, option labelled a to
+station j, option labelled b costs on top (a plan bars legs that collide); barred of size 0: nothing.
 """
 
 import math
@@ -71,7 +72,7 @@ def legs_from(options, i, k, j, count, law, timed, sums, tops, out):  # type: ig
 
 
 @njit(cache=True, error_model="numpy")
-def choose_options(options, count, tour, law, timed, choice, work):  # type: ignore[no-untyped-def]
+def choose_options(options, count, label, barred, tour, law, timed, choice, work):  # type: ignore[no-untyped-def]
     """Write the best option of every station into choice (n,) for the closed tour (n + 1,) with its dummy in front.
 
     Exact for that order, dynamic programming from the first station on. Returns the length. work: scratch from
@@ -89,6 +90,9 @@ def choose_options(options, count, tour, law, timed, choice, work):  # type: ign
             new[c] = np.inf
         for k in range(count[i]):
             legs_from(options, i, k, j, count[j], law, timed, sums, tops, leg)
+            if barred.size:
+                for c in range(count[j]):
+                    leg[c] += barred[i, j, label[i, k], label[j, c]]
             for c in range(count[j]):
                 value = old[k] + leg[c]
                 if value < new[c]:
@@ -110,13 +114,12 @@ def choose_options(options, count, tour, law, timed, choice, work):  # type: ign
 @njit(cache=True, error_model="numpy")
 def scratch(n, most):  # type: ignore[no-untyped-def]
     """Return the working arrays of ``choose_options`` for n stations of at most ``most`` options."""
-    return (
-        np.empty((2, most)), np.empty(most), np.empty(most), np.empty(most), np.zeros((max(n, 1), most), dtype=np.int64),
-    )  # fmt: skip
+    back = np.zeros((max(n, 1), most), dtype=np.int64)
+    return np.empty((2, most)), np.empty(most), np.empty(most), np.empty(most), back
 
 
 @njit(cache=True, error_model="numpy")
-def _chosen_distances(options, choice, law, timed, picked, work, distances):  # type: ignore[no-untyped-def]
+def _chosen_distances(options, label, barred, choice, law, timed, picked, work, distances):  # type: ignore[no-untyped-def]
     """Write the leg costs between the chosen options into distances (n + 1, n + 1), the dummy in front."""
     _, leg, sums, tops, _ = work
     n, r = options.shape[0], options.shape[1]
@@ -126,15 +129,18 @@ def _chosen_distances(options, choice, law, timed, picked, work, distances):  # 
     for i in range(n):
         legs_from(picked, 0, i, 0, i, law, timed, sums, tops, leg)
         for j in range(i):
+            if barred.size:
+                leg[j] += barred[i, j, label[i, choice[i]], label[j, choice[j]]]
             distances[i + 1, j + 1] = leg[j]
             distances[j + 1, i + 1] = leg[j]
 
 
 @njit(cache=True, error_model="numpy")
-def joint_tour(options, count, law, timed, tour):  # type: ignore[no-untyped-def]
+def joint_tour(options, count, label, barred, law, timed, tour, rounds):  # type: ignore[no-untyped-def]
     """Return (length, choice (n,)) and improve the closed tour (n + 1,) with its dummy in front, in place.
 
-    Args: options (n, r, K) rad; count (n,) >= 1; law (4, r); timed; tour: any start, tour[0] = 0, station + 1.
+    Args: see the module; options (n, r, K) rad; count (n,) >= 1; tour: any start, tour[0] = 0, station + 1; rounds: how
+    often order and options take turns at most.
     """
     n, r, most = options.shape
     work = scratch(n, max(most, n))
@@ -142,17 +148,17 @@ def joint_tour(options, count, law, timed, tour):  # type: ignore[no-untyped-def
     picked = np.empty((1, r, n))
     choice, other = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
     trial = tour.copy()
-    best = choose_options(options, count, tour, law, timed, choice, work)
-    for _ in range(_ROUNDS):
+    best = choose_options(options, count, label, barred, tour, law, timed, choice, work)
+    for _ in range(rounds):
         if n < 3:
             break
-        _chosen_distances(options, choice, law, timed, picked, work, distances)
+        _chosen_distances(options, label, barred, choice, law, timed, picked, work, distances)
         for x in range(n + 1):
             trial[x] = tour[x]
         shorter = _improve(distances, trial, pairs)
         if shorter > best * (1.0 - 1e-9):
             break
-        best = choose_options(options, count, trial, law, timed, other, work)
+        best = choose_options(options, count, label, barred, trial, law, timed, other, work)
         for x in range(n + 1):
             tour[x] = trial[x]
         for i in range(n):
@@ -162,7 +168,7 @@ def joint_tour(options, count, law, timed, tour):  # type: ignore[no-untyped-def
 
 @njit(cache=True, error_model="numpy")
 def directions_tour(viewpoints):  # type: ignore[no-untyped-def]
-    """Return the closed tour (n + 1,), dummy in front, of viewpoints (n, 2) by nearest neighbour and 3-opt of chords."""
+    """Return the closed tour (n + 1,), dummy in front, of viewpoints (n, 2): nearest neighbour and 3-opt of chords."""
     n = viewpoints.shape[0]
     distances = np.zeros((n + 1, n + 1))
     unit = np.empty((n, 3))
@@ -201,5 +207,7 @@ def network_tour(arrays, law, timed, dwell, viewpoints):  # type: ignore[no-unty
     refused = n - kept
     if kept < 2:
         return (dwell * n if timed else 0.0), refused
-    length, _ = joint_tour(options[:kept], count[:kept], law, timed, directions_tour(seen[:kept]))
+    label, barred = np.empty((0, 0), dtype=np.int64), np.empty((0, 0, 0, 0))
+    tour = directions_tour(seen[:kept])
+    length, _ = joint_tour(options[:kept], count[:kept], label, barred, law, timed, tour, _ROUNDS)
     return (length + dwell * n if timed else length), refused

@@ -100,7 +100,9 @@ def find_robot(name: str) -> tuple[Path, tuple[Path, ...], str | None]:
     try:
         files = importlib.metadata.files("example-robot-data") or []
     except importlib.metadata.PackageNotFoundError:
-        raise EnvironmentProblem("robot models: expected the package example-robot-data, found none installed") from None
+        raise EnvironmentProblem(
+            "robot models: expected the package example-robot-data, found none installed"
+        ) from None
     known = {file.name.removesuffix(".urdf"): file for file in files if file.name.endswith(".urdf")}
     found = known.get(f"{name}_robot") or known.get(name)
     if found is None:
@@ -140,8 +142,7 @@ def load_chain(cell: RobotCell) -> Chain:
         geometry = pin.buildGeomFromUrdf(model, str(cell.urdf), pin.GeometryType.COLLISION, package_dirs=folders)
     except ValueError as error:
         raise InputError(f"robot.urdf: {cell.urdf.name}: {' '.join(str(error).split())}") from None
-    tool = _tool_frame(model, cell)
-    model, geometry, tool = _reduce(model, geometry, tool, cell)
+    model, geometry, tool = _reduce(model, geometry, _tool_frame(model, cell), cell)
     joints = list(range(1, model.njoints))
     _check_serial(model, cell)
     # `turned[i]`: the joint's own frame in pinocchio from our link frame, whose z is the joint axis.
@@ -153,8 +154,8 @@ def load_chain(cell: RobotCell) -> Chain:
     lower, upper = _limits(model, names, cell)
     urdf_speed = np.where(model.velocityLimit > 0, model.velocityLimit, np.inf)
     frame = model.frames[tool]
-    base = model.getFrameId("base") if model.existFrame("base") else 0
-    base_from_controller = model.frames[base].placement.homogeneous if model.frames[base].parentJoint == 0 else np.eye(4)
+    base = model.frames[model.getFrameId("base") if model.existFrame("base") else 0]
+    base_from_controller = base.placement.homogeneous if base.parentJoint == 0 else np.eye(4)
     return Chain(
         name=cell.name,
         joint_names=names,
@@ -193,9 +194,7 @@ def _reduce(model: Any, geometry: Any, tool: str, cell: RobotCell) -> tuple[Any,
             raise InputError(f"robot.lock: expected one of {', '.join(known)}; found {name!r}")
         joint = model.joints[model.getJointId(name)]
         rest[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
-    locked = [
-        index for index in range(1, model.njoints) if index not in moving or model.names[index] in cell.lock
-    ]
+    locked = [index for index in range(1, model.njoints) if index not in moving or model.names[index] in cell.lock]
     reduced, (shapes,) = pin.buildReducedModel(model, [geometry], locked, rest)
     if reduced.njoints < 2:
         raise InputError(f"robot.tool_frame: expected a frame that joints move, found {tool!r} fixed to the base")

@@ -67,7 +67,7 @@ def ur_arm(chain: Chain, tolerance: float = 1e-9) -> UrArm | None:
     # The point of axis 5 that lies on axis 6: solve s a5 - t a6 = offset in the least-squares sense.
     (along, _), *_ = np.linalg.lstsq(np.stack([a[4], -a[5]], axis=1), offset, rcond=None)
     flange = base_from_flange(chain, np.zeros((1, 6)))[0]
-    return UrArm(axes=a, points=points[:4], wrist=points[4] + along * a[4], flange_inverse=inverse(flange))
+    return UrArm(axes=a, points=np.array(points[:4]), wrist=points[4] + along * a[4], flange_inverse=inverse(flange))
 
 
 @njit(cache=True, error_model="numpy")

@@ -1,0 +1,133 @@
+"""Exact joint options of the stations of a plan: every branch at every roll, solved to the pose, tested, and lifted."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.motion.cell import ArmCell
+from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION, REASONS, states
+from netdesign.motion.joint_map import JointMap, solve_closed
+from netdesign.motion.joint_sheets import free_joints
+from netdesign.motion.kinematics import into_limits, refine
+
+PLAN_ROLLS = 24
+_TURN = 2.0 * np.pi
+
+
+@dataclass(frozen=True, kw_only=True)
+class StationOptions:
+    """Joint options of n stations, option by column as the kernels want them.
+
+    Attributes:
+        joints: (n, r, K) rad, each inside the limits.  count: (n,).  label: (n, K) branch of each option.
+        refused: station index and reason of the stations without any option.
+    """
+
+    joints: Floats
+    count: Ints
+    label: Ints
+    refused: tuple[tuple[int, str], ...]
+
+    def keep(self, station: int, chosen: list[int]) -> tuple[Floats, Ints]:
+        """Return joints (k, r) and labels (k,) of some options of a station."""
+        return self.joints[station][:, chosen].T, self.label[station, chosen]
+
+
+def exact_options(joint_map: JointMap, viewpoints: Floats) -> StationOptions:
+    """Return the exact options of viewpoints (n, 2): closed form, or refined from the sheets of the map.
+
+    A station that capsules leave without an option is tested again with the real meshes.
+    """
+    solve = _closed_options if joint_map.arm.ur is not None else _sheet_options
+    found = [solve(joint_map, viewpoint) for viewpoint in viewpoints]
+    arm = joint_map.arm
+    kept: list[tuple[Floats, Ints]] = []
+    refused: list[tuple[int, str]] = []
+    for index, (joints, label, reason) in enumerate(found):
+        state = states(arm.body, joints) if len(joints) else np.zeros(0, dtype=np.int8)
+        free = state == FREE
+        if len(joints) and not free.any():
+            free = _free_on_meshes(arm, joints)
+            reason = REASONS[int(np.bincount(state).argmax())]
+        if not free.any():
+            refused.append((index, reason))
+        kept.append((joints[free], label[free]))
+    return _packed(kept, len(arm.chain), tuple(refused))
+
+
+def _free_on_meshes(arm: ArmCell, joints: Floats) -> Bools:
+    """Return which of joints (k, r) are free on the real meshes, the line of sight still by capsules."""
+    # A margin of -100 m and no pairs leave nothing but the line of sight to be tested.
+    sight_only = arm.body._replace(pairs=np.zeros((0, 2), dtype=np.int64), margin=-100.0)
+    sees = states(sight_only, joints) == FREE
+    return np.array([clear and not arm.meshes.contact(q) for clear, q in zip(sees.tolist(), joints, strict=True)])
+
+
+def lifted(options: StationOptions, chosen: list[list[int]], lower: Floats, upper: Floats) -> StationOptions:
+    """Return the chosen options of every station in every turn of every joint inside the limits (r,)."""
+    kept = []
+    for station, indices in enumerate(chosen):
+        copies: list[tuple[float, ...]] = []
+        labels: list[int] = []
+        for q, branch in zip(*options.keep(station, indices), strict=True):
+            turns = [
+                [value + turn * _TURN for turn in (0, -1, 1) if low <= value + turn * _TURN <= high]
+                for value, low, high in zip(q.tolist(), lower.tolist(), upper.tolist(), strict=True)
+            ]
+            combinations = list(itertools.product(*turns))
+            copies += combinations
+            labels += [int(branch)] * len(combinations)
+        kept.append((np.array(copies), np.array(labels, dtype=np.int64)))
+    return _packed(kept, options.joints.shape[1], ())
+
+
+def _packed(kept: list[tuple[Floats, Ints]], r: int, refused: tuple[tuple[int, str], ...]) -> StationOptions:
+    most = max([len(joints) for joints, _ in kept] + [1])
+    packed, labels = np.zeros((len(kept), r, most)), np.zeros((len(kept), most), dtype=np.int64)
+    for index, (joints, label) in enumerate(kept):
+        packed[index, :, : len(joints)] = joints.T.reshape(r, len(joints))
+        labels[index, : len(joints)] = label
+    count = np.array([len(joints) for joints, _ in kept], dtype=np.int64)
+    return StationOptions(joints=packed, count=count, label=labels, refused=refused)
+
+
+def _rolls(joint_map: JointMap) -> Floats:
+    if joint_map.sphere.roll is not None or joint_map.follows:
+        return joint_map.rolls
+    count = PLAN_ROLLS if joint_map.arm.ur is not None else len(joint_map.rolls)
+    return np.arange(count, dtype=np.float64) * (_TURN / count)
+
+
+def _closed_options(joint_map: JointMap, viewpoint: Floats) -> tuple[Floats, Ints, str]:
+    """Return joints (k, 6) inside the limits, their branch labels (k,), and why there are none."""
+    sphere, placed = joint_map.sphere, joint_map.arm.placed
+    rolls = _rolls(joint_map)
+    targets = sphere.cameras(np.tile(viewpoint, (len(rolls), 1)), rolls)
+    solved, found = solve_closed(joint_map.arm, targets)
+    if joint_map.follows:
+        solved[..., -1] = joint_map.rest
+    label = np.broadcast_to(np.arange(found.shape[1]), found.shape)[found]
+    joints = np.ascontiguousarray(solved[found])
+    if not len(joints):
+        return joints.reshape(0, len(placed)), label, REASONS[NO_SOLUTION]
+    inside = np.array([into_limits(q, placed.lower, placed.upper) for q in joints])
+    return joints[inside], label[inside], REASONS[LIMITS]
+
+
+def _sheet_options(joint_map: JointMap, viewpoint: Floats) -> tuple[Floats, Ints, str]:
+    """Return joints (k, r), the sheet of each (k,), and why there are none."""
+    sphere, placed = joint_map.sphere, joint_map.arm.placed
+    free = free_joints(placed)
+    joints, label = [], []
+    for layer, roll in enumerate(_rolls(joint_map)):
+        target = sphere.cameras(viewpoint, roll)
+        for sheet, start in joint_map.near(viewpoint, layer):
+            q = start.copy()
+            if refine(
+                placed.placements, placed.last_from_flange, placed.lower, placed.upper, placed.wraps, free, target, q
+            ):
+                joints.append(q)
+                label.append(sheet)
+    return np.array(joints).reshape(-1, len(placed)), np.array(label, dtype=np.int64), REASONS[NO_SOLUTION]

@@ -1,0 +1,275 @@
+"""The motion of one network, final: order, branches and rolls, exact joints inside their limits, every leg free.
+
+1. Every branch at every roll is solved exactly and tested (``options``).
+2. Order and options alternate from several starts, joint differences modulo whole turns (``joint_tour``); small
+   problems are solved exactly (``exact_tour``).
+3. The best options of every station, in all turns inside the limits, take part in the same alternation without the
+   modulo: what comes out can be driven.
+4. Every leg is tested; a colliding one is barred for its pair of branches and step 3 is repeated. Where that does not
+   help, via points are put in.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from netdesign.model.arrays import Floats, Ints
+from netdesign.model.results import Tour
+from netdesign.model.scene import Part
+from netdesign.model.task import RobotCell, ViewingSphere
+from netdesign.motion.exact_tour import exact_joint_tour
+from netdesign.motion.joint_map import JointMap
+from netdesign.motion.joint_tour import directions_tour, joint_tour, law_of, legs_from, scratch
+from netdesign.motion.kinematics import forward
+from netdesign.motion.legs import Legs
+from netdesign.motion.options import StationOptions, exact_options, lifted
+from netdesign.motion.tour import open_path
+
+_ROUNDS = 20
+_STARTS = 6
+_EXACT_STATES = 80  # stations times options up to which the modulo problem is solved exactly
+_EXACT_STATIONS = 10
+_LIFTED_OPTIONS = 12  # options per station that take part in the lift
+_BARRED = 1e3
+_REPAIRS = 30
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The motion of a network; arrays in visiting order.
+
+    Attributes:
+        tour: order into the viewpoints given, joints (n, r) rad, length; None when stations are refused.
+        world_from_cam: (n, 4, 4) m, from the joints.  viewpoints: (n, 2) rad.
+        vias: via points (k, r) of the legs that need them, by number of the leg; their way is in the tour's length.
+        warnings: what was done about collisions.
+        refused: index into the viewpoints given, and reason.
+    """
+
+    tour: Tour | None
+    world_from_cam: Floats
+    viewpoints: Floats
+    vias: dict[int, Floats] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    refused: tuple[tuple[int, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Options and costs of one plan."""
+
+    options: StationOptions
+    law: Floats
+    timed: bool
+    barred: Floats
+
+    def tour(self, start: Ints) -> tuple[float, Ints, Ints]:
+        """Return (length, closed tour, choice) of the alternation from a closed tour (n + 1,)."""
+        tour = start.copy()
+        o = self.options
+        length, choice = joint_tour(o.joints, o.count, o.label, self.barred, self.law, self.timed, tour, _ROUNDS)
+        return float(length), tour, choice
+
+    def exact(self) -> tuple[float, Ints, Ints]:
+        """Return the same of the exact optimum."""
+        o = self.options
+        tour, choice, length = exact_joint_tour(o.joints, o.count, o.label, self.barred, self.law, self.timed)
+        return float(length), tour, choice
+
+
+def plan(
+    cell: RobotCell,
+    sphere: ViewingSphere,
+    part: Part,
+    viewpoints: Floats,
+    motion: Literal["joint", "time"] = "joint",
+    seed: int = 0,
+) -> Plan:
+    """Return the motion over viewpoints (n, 2), see ``plan_on``; builds or reads the joint map first."""
+    return plan_on(JointMap.build(cell, sphere, part), viewpoints, motion, seed)
+
+
+def plan_on(joint_map: JointMap, viewpoints: Floats, motion: Literal["joint", "time"] = "joint", seed: int = 0) -> Plan:
+    """Return the motion of the arm over viewpoints (n, 2) = (alpha, beta) rad, n >= 1, in the best order found.
+
+    The tour's length is the sum of the driven legs: weighted rad, or s with the dwell at every station.
+    """
+    viewpoints = np.ascontiguousarray(viewpoints, dtype=np.float64)
+    options = exact_options(joint_map, viewpoints)
+    if options.refused:
+        return Plan(tour=None, world_from_cam=np.zeros((0, 4, 4)), viewpoints=np.zeros((0, 2)), refused=options.refused)
+    arm, timed = joint_map.arm, motion == "time"
+    labels = int(options.label.max()) + 1
+    free = np.zeros((0, 0, 0, 0))
+    modulo = _Problem(options, law_of(arm), timed, free)
+    starts = _starts(modulo, viewpoints, seed)
+    legs = Legs(joint_map)
+    barred = np.zeros((len(viewpoints), len(viewpoints), labels, labels))
+    order, joints, notes = _repaired(modulo, starts, legs, barred, arm.placed.lower, arm.placed.upper)
+    vias, more, refused = _vias(legs, joints, order)
+    if refused:
+        return Plan(tour=None, world_from_cam=np.zeros((0, 4, 4)), viewpoints=np.zeros((0, 2)), refused=refused)
+    length = tour_length(joints, vias, law_of(arm), timed)
+    if timed:
+        length += joint_map.arm.cell.dwell * len(joints)
+    return Plan(
+        tour=Tour(order=order, length=length, space=motion, joints=joints),
+        world_from_cam=forward(arm.body.placements, arm.body.last_from_cam, joints),
+        viewpoints=viewpoints[order],
+        vias=vias,
+        warnings=(*notes, *more),
+    )
+
+
+def tour_length(joints: Floats, vias: dict[int, Floats], law: Floats, timed: bool) -> float:
+    """Return the cost of driving joints (n, r) in order over the via points, without dwell."""
+    way = [joints[:1]]
+    for leg in range(len(joints) - 1):
+        way += [vias[leg]] if leg in vias else []
+        way.append(joints[leg + 1 : leg + 2])
+    points = np.concatenate(way)
+    change = np.abs(np.diff(points, axis=0))
+    if not timed:
+        return float(np.sqrt(((law[0] * change) ** 2).sum(axis=1)).sum())
+    longest, hardest = (change * law[1]).max(axis=1), (change * law[2]).max(axis=1)
+    cruise = longest**2 >= hardest
+    ramp = hardest / np.where(longest > 0, longest, 1.0)
+    return float(np.where(cruise, longest + ramp, 2.0 * np.sqrt(hardest)).sum())
+
+
+def _plain(law: Floats) -> Floats:
+    """Return the law without wrapping: differences as they are driven."""
+    flat = law.copy()
+    flat[3] = 0.0
+    return flat
+
+
+def _starts(problem: _Problem, viewpoints: Floats, seed: int) -> list[tuple[float, Ints, Ints]]:
+    """Return tours modulo whole turns, the best first; the exact optimum only where it can be had."""
+    count, most = len(viewpoints), problem.options.joints.shape[2]
+    first = directions_tour(viewpoints)
+    found = [problem.tour(first)]
+    if count <= _EXACT_STATIONS and count * most <= _EXACT_STATES:
+        found.append(problem.exact())
+    rng = np.random.default_rng(seed)
+    for attempt in range(_STARTS if count > 3 else 0):
+        best = min(found, key=lambda item: item[0])[1]
+        if attempt == 0:
+            start = np.concatenate([[0], 1 + open_path(_nearest_options(problem))[0]]).astype(np.int64)
+        else:
+            cuts = np.sort(rng.choice(np.arange(1, count), size=2, replace=False))
+            pieces = np.split(best[1:], cuts)
+            start = np.concatenate([best[:1], *[pieces[index] for index in rng.permutation(3)]])
+        found.append(problem.tour(start))
+    found.sort(key=lambda item: item[0])
+    return found
+
+
+def _nearest_options(problem: _Problem) -> Floats:
+    """Return the least cost (n, n) of a leg between two stations over all their options."""
+    options = problem.options
+    count, _, most = options.joints.shape
+    _, leg, sums, tops, _ = scratch(count, most)
+    distance = np.zeros((count, count))
+    for i in range(count):
+        for j in range(i):
+            least = np.inf
+            for k in range(0, options.count[i], max(options.count[i] // 24, 1)):
+                legs_from(options.joints, i, k, j, options.count[j], problem.law, problem.timed, sums, tops, leg)
+                least = min(least, float(leg[: options.count[j]].min()))
+            distance[i, j] = distance[j, i] = least
+    return distance
+
+
+def _best_through(problem: _Problem, tour: Ints) -> list[list[int]]:
+    """Return, per station, the options with the shortest tours through them for one order, the best first."""
+    options = problem.options
+    count, _, most = options.joints.shape
+    _, leg, sums, tops, _ = scratch(count, most)
+    forward_cost, backward = np.full((count, most), np.inf), np.full((count, most), np.inf)
+    stations = tour[1:] - 1
+    for costs, route in ((forward_cost, stations), (backward, stations[::-1])):
+        costs[route[0], : options.count[route[0]]] = 0.0
+        for i, j in zip(route[:-1].tolist(), route[1:].tolist(), strict=True):
+            reach = options.count[j]
+            for k in range(options.count[i]):
+                legs_from(options.joints, i, k, j, reach, problem.law, problem.timed, sums, tops, leg)
+                np.minimum(costs[j, :reach], costs[i, k] + leg[:reach], out=costs[j, :reach])
+    total = forward_cost + backward
+    return [np.argsort(total[i, : options.count[i]], kind="stable")[:_LIFTED_OPTIONS].tolist() for i in range(count)]
+
+
+def _repaired(
+    modulo: _Problem, starts: list[tuple[float, Ints, Ints]], legs: Legs, barred: Floats, lower: Floats, upper: Floats
+) -> tuple[Ints, Floats, tuple[str, ...]]:
+    """Return (order (n,), joints (n, r) in that order, notes): lifted, colliding legs barred while that helps."""
+    candidates = []
+    for _, tour, _ in starts[:2]:
+        options = lifted(modulo.options, _best_through(modulo, tour), lower, upper)
+        problem = _Problem(options, _plain(modulo.law), modulo.timed, barred)
+        candidates.append((problem.tour(tour), problem))
+    (_, tour, _), problem = min(candidates, key=lambda item: item[0][0])
+    fewest, best, attempts = len(tour), (tour[1:] - 1, np.zeros((0, 0))), 0
+    for attempt in range(_REPAIRS + 1):
+        order, joints, labels = _ordered(problem, tour)
+        colliding = [leg for leg in range(len(order) - 1) if legs.contact(joints[leg], joints[leg + 1])]
+        if attempt == 0 or len(colliding) < fewest:
+            fewest, best, attempts = len(colliding), (order, joints), attempt
+        if not colliding:
+            break
+        for leg in colliding:
+            i, j, a, b = order[leg], order[leg + 1], labels[leg], labels[leg + 1]
+            barred[i, j, a, b] = barred[j, i, b, a] = _BARRED
+    notes = () if attempts == 0 else (f"tour re-planned {attempts} times around legs that collide",)
+    return *best, notes
+
+
+def _ordered(problem: _Problem, tour: Ints) -> tuple[Ints, Floats, Ints]:
+    """Return (order (n,), joints (n, r), labels (n,)) of the lifted problem, the order also the best for its joints."""
+    options = problem.options
+    length, tour, choice = problem.tour(tour)
+    while True:
+        stations = np.arange(len(choice))
+        joints, labels = options.joints[stations, :, choice], options.label[stations, choice]
+        order, shorter = open_path(_distances(joints, labels, problem))
+        if shorter >= length * (1.0 - 1e-9):
+            break
+        length, tour, choice = problem.tour(np.concatenate([[0], order + 1]).astype(np.int64))
+    order = tour[1:] - 1
+    return order, np.ascontiguousarray(joints[order]), labels[order]
+
+
+def _distances(joints: Floats, labels: Ints, problem: _Problem) -> Floats:
+    """Return the cost (n, n) of the legs between joints (n, r), barred legs included."""
+    change = np.abs(joints[:, None] - joints)
+    if problem.timed:
+        longest, hardest = (change * problem.law[1]).max(axis=2), (change * problem.law[2]).max(axis=2)
+        ramp = hardest / np.where(longest > 0, longest, 1.0)
+        cost = np.where(longest**2 >= hardest, longest + ramp, 2.0 * np.sqrt(hardest))
+    else:
+        cost = np.sqrt(((problem.law[0] * change) ** 2).sum(axis=2))
+    stations = np.arange(len(joints))
+    cost = cost + problem.barred[stations[:, None], stations, labels[:, None], labels]
+    np.fill_diagonal(cost, 0.0)
+    return np.asarray(cost)
+
+
+def _vias(
+    legs: Legs, joints: Floats, order: Ints
+) -> tuple[dict[int, Floats], tuple[str, ...], tuple[tuple[int, str], ...]]:
+    """Return via points of the legs that still collide, what is to be said, and stations that cannot be left."""
+    vias: dict[int, Floats] = {}
+    notes: list[str] = []
+    refused: list[tuple[int, str]] = []
+    for leg in range(len(joints) - 1):
+        contact = legs.contact(joints[leg], joints[leg + 1])
+        if not contact:
+            continue
+        found = legs.detour(joints[leg], joints[leg + 1])
+        if found is None:
+            refused.append((int(order[leg]), f"no free way to the next station: {contact}"))
+        else:
+            vias[leg] = found
+            notes.append(f"leg {leg + 1} goes over {len(found)} via point(s): on the straight line {contact}")
+    return vias, tuple(notes), tuple(refused)

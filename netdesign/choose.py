@@ -8,12 +8,12 @@ import numpy as np
 
 from netdesign.errors import InputError
 from netdesign.files.store import plain, read_json
-from netdesign.files.study import load_task
 from netdesign.model.arrays import Floats
 from netdesign.model.task import Task
 from netdesign.placement import decide
 from netdesign.placement.decide import Requirement
 from netdesign.placement.distances import distance_u95
+from netdesign.run_folder import open_run
 
 MM = 1e-3
 SIGMA = "largest point sigma"
@@ -126,7 +126,7 @@ def choose(
             raise InputError(f"{name}: expected a positive number, found {limit:g}")
     design = read_design(run)
     objectives, networks = objectives_of(design), design["networks"]
-    task = load_task(run / "study.toml")
+    task = open_run(run)
     own = task.study.requirements
     asked_here = knee or any(limit is not None for limit in (max_sigma_um, max_images, max_tour))
     if asked_here:
@@ -269,7 +269,9 @@ def _warnings(network: dict[str, Any], row: FrontRow, asked: tuple[dict[str, Any
 
 def _verdict(run: Path, network: int) -> str:
     path = run / "networks" / f"{network:04d}" / "validation.json"
-    return str(read_json(path, "validation").get("verdict", "no verdict")) if path.is_file() else "not validated"
+    return (
+        str(read_json(path, "network-validation").get("verdict", "no verdict")) if path.is_file() else "not validated"
+    )
 
 
 def _index(networks: list[dict[str, Any]], network: int) -> int:

@@ -8,11 +8,18 @@ import numpy as np
 import tomli_w
 import trimesh
 
+from netdesign.adjustment.bundle import adjust
+from netdesign.adjustment.compare import compare
+from netdesign.files.adjustment import adjustment_payload, validation_payload
+from netdesign.files.design_json import read_networks, write_design
 from netdesign.files.parts import TAG_COLUMNS
 from netdesign.files.store import write_json
 from netdesign.files.study import load_task
-from netdesign.model.frames import look_at, sphere_directions
-from netdesign.photogrammetry.collinearity import project_with_jacobians
+from netdesign.model.frames import exp_rotation, look_at, pose, sphere_directions
+from netdesign.model.network import Observations
+from netdesign.model.results import Design, DesignedNetwork, PointPrecision, SearchHistory, Tour
+from netdesign.photogrammetry.collinearity import project, project_with_jacobians
+from netdesign.photogrammetry.total_error import total_covariance
 from tests.scenes import CAMERA, box_scene
 
 STUDY = {
@@ -74,50 +81,51 @@ def ring_viewpoints(count, elevation, top):
     return viewpoints
 
 
-def design_payload(task, candidates):
-    """The content of design.json for networks given by their viewpoints, dominated ones removed."""
-    points = task.scene.targets.points
-    networks = []
+def front_of(task, candidates):
+    """Return the Design of networks given by their viewpoints, inadmissible and dominated ones removed."""
+    points, networks = task.scene.targets.points, []
     for viewpoints in candidates:
         poses = look_at(0.6 * sphere_directions(viewpoints), np.zeros(3))
         visible = convex_visible(task, poses)
         if visible.sum(axis=0).min() < task.limits.min_rays:
             continue
-        covariance = limited(task, poses, visible)
-        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) * 1e6
-        tour = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum() * 1e3
-        poses[:, :3, 3] *= 1e3
+        precision = PointPrecision(
+            covariance=limited(task, poses, visible),
+            rays=visible.sum(axis=0),
+            propagation="limited",
+            datum="poses error-free (limited error propagation)",
+        )
+        total = total_covariance(poses, points, task.camera.intrinsics, visible, task.camera.sigma_px)
+        length = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+        # No network sees a point under better geometry than n rays from the nearest admissible distance.
+        nearest = 0.6 - np.linalg.norm(points, axis=1).max()
+        bound = 1.5 * (task.camera.sigma_px * nearest / task.camera.focal_px[0]) ** 2 / len(poses)
         networks.append(
-            {
-                "objectives": [float((sigma**2).mean() * 1e-6), float(tour), len(poses)],
-                "viewpoints_deg": np.degrees(viewpoints).tolist(), "world_from_cam_mm": poses.tolist(),
-                "joints_rad": None, "rms_sigma_um": float(np.sqrt((sigma**2).mean())),
-                "max_sigma_um": float(sigma.max()), "total_rms_sigma_um": None, "bound_ratio": None,
-                "rays": visible.sum(axis=0).tolist(), "sigma_um": sigma.tolist(), "warnings": [],
-            }
-        )  # fmt: skip
-    objectives = np.array([network["objectives"] for network in networks])
-    dominated = [((objectives <= row).all(axis=1) & (objectives < row).any(axis=1)).any() for row in objectives]
-    kept = [network for network, out in zip(networks, dominated, strict=True) if not out]
-    kept.sort(key=lambda network: (network["objectives"][2], network["objectives"][0]))
-    for index, network in enumerate(kept):
-        network["id"] = index
-    normals = task.scene.targets.point_normals
-    return {
-        "objectives": [
-            {"name": "mean point variance", "unit": "mm^2"}, {"name": "tour (workspace)", "unit": "mm"},
-            {"name": "images", "unit": "1"},
-        ],
-        "points": [
-            {"id": name, "xyz_mm": (1e3 * xyz).tolist(), "normal": normal.tolist()}
-            for name, xyz, normal in zip(task.scene.targets.point_ids, points, normals, strict=True)
-        ],
-        "camera": task.study.camera.model_dump(mode="json"),
-        "history": {"evaluations": [len(candidates)], "hypervolume": [1.0]},
-        "bounds": {},
-        "notes": [],
-        "networks": kept,
-    }  # fmt: skip
+            DesignedNetwork(
+                viewpoints=viewpoints,
+                world_from_cam=poses,
+                f1=precision.mean_variance,
+                f2=length,
+                f3=len(poses),
+                tour=Tour(order=np.arange(len(poses)), length=length, space="workspace"),
+                precision=precision,
+                total=total.precision,
+                bound_ratio=precision.mean_variance / bound,
+                warnings=total.diagnosis,
+            )
+        )
+    objectives = np.array([[network.f1, network.f2, network.f3] for network in networks])
+    kept = [
+        network
+        for network, row in zip(networks, objectives, strict=True)
+        if not ((objectives <= row).all(axis=1) & (objectives < row).any(axis=1)).any()
+    ]
+    kept.sort(key=lambda network: (network.f3, network.f1))
+    return Design(
+        networks=tuple(kept),
+        history=SearchHistory(evaluations=[len(candidates)], hypervolume=[1.0]),
+        bounds={network.f3: network.f1 / network.bound_ratio for network in kept},
+    )
 
 
 def ring_run(run, requirements=None, sizes=range(7, 14)):
@@ -130,5 +138,56 @@ def ring_run(run, requirements=None, sizes=range(7, 14)):
         for elevation in (26, 32, 38, 44, 50)
         for top in (False, True)
     ]
-    write_json(run / "design.json", "design", design_payload(task, candidates), task.sha256)
+    write_design(run / "design.json", task, front_of(task, candidates))
     return task
+
+
+def prove(run, task, networks=None, noise=1.0):
+    """Adjust simulated image points of networks of a run with GTSAM and write what ``validate`` would.
+
+    The true noise is ``noise`` times the predicted one. The poses are executed with 1 mm and 5 mrad of error.
+    """
+    points, ids = task.scene.targets.points, task.scene.targets.point_ids
+    for network in read_networks(run).values():
+        if networks is not None and network.id not in networks:
+            continue
+        random = np.random.default_rng([3, network.id])
+        count = len(network.world_from_cam)
+        error = pose(
+            exp_rotation(random.normal(scale=5e-3, size=(count, 3))), random.normal(scale=1e-3, size=(count, 3))
+        )
+        poses = network.world_from_cam @ error
+        image, point = np.nonzero(convex_visible(task, poses))
+        sigma = task.camera.sigma_px
+        xy, _ = project(poses[image], points[point], task.camera.intrinsics)
+        observations = Observations(
+            image=image, point=point, xy_px=xy + random.normal(scale=noise * sigma, size=xy.shape),
+            covariance=np.tile(sigma**2 * np.eye(2), (len(image), 1, 1)),
+        )  # fmt: skip
+        adjustment = adjust(observations, task.camera, network.world_from_cam, points)
+        visible = convex_visible(task, network.world_from_cam)
+        total = total_covariance(network.world_from_cam, points, task.camera.intrinsics, visible, sigma)
+        limited_precision = PointPrecision(
+            covariance=total.limited, rays=total.rays, propagation="limited", datum="poses error-free"
+        )
+        validation = compare(points, adjustment, limited_precision, total.precision)
+        record = validation_payload(validation, ids)
+        record |= {"network": network.id, "repeat": 0, "verdict": "pass" if validation.passed else "fail"}
+        folder = run / "networks" / f"{network.id:04d}"
+        names = [f"{index:04d}.png" for index in range(count)]
+        payload = adjustment_payload(adjustment, names, ids)
+        write_json(folder / "adjustment.json", "adjustment", payload, task.sha256)
+        write_json(folder / "validation.json", "network-validation", record, task.sha256)
+
+
+def fail(run, task, network, reason):
+    """Write the validation of a network that could not be adjusted."""
+    record = {
+        "network": network,
+        "repeat": 0,
+        "verdict": "failed",
+        "passed": False,
+        "reasons": [reason],
+        "warnings": [],
+    }
+    write_json(run / f"networks/{network:04d}/validation.json", "network-validation", record, task.sha256)

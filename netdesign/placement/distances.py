@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from netdesign.model.arrays import Floats, Ints
+from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.task import Task
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_error import TotalError, total_covariance
@@ -11,9 +11,14 @@ from netdesign.photogrammetry.visibility import sightings
 COVERAGE_FACTOR = 2.0  # k = 2, about 95 % for one degree of freedom (GUM 6.3)
 
 
-def network_total_error(task: Task, world_from_cam: Floats) -> TotalError:
-    """Return the total error propagation of images with poses (n, 4, 4) m, with the exact sightings of the study."""
-    visible = sightings(task.scene, task.camera, world_from_cam, task.limits).visible
+def network_total_error(task: Task, world_from_cam: Floats, visible: Bools | None = None) -> TotalError:
+    """Return the total error propagation of images with poses (n, 4, 4) m.
+
+    Args:
+        visible: (n, m) which image sees which object point; default: the exact sightings of the study.
+    """
+    if visible is None:
+        visible = sightings(task.scene, task.camera, world_from_cam, task.limits).visible
     sigma = sighting_sigma(task.camera, world_from_cam, task.scene.targets)
     return total_covariance(world_from_cam, task.scene.targets.points, task.camera.intrinsics, visible, sigma)
 

@@ -1,0 +1,115 @@
+"""The report of a run: RUN/report.html, one file that needs nothing else, and RUN/figures/*.png."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from netdesign.choose import choose, poses_of, read_design
+from netdesign.errors import InfeasibleError
+from netdesign.files.store import read_json, write_bytes, write_text
+from netdesign.files.study_text import study_toml
+from netdesign.model.task import Task
+from netdesign.photogrammetry.total_error import DATUM
+from netdesign.photogrammetry.visibility import Sight
+from netdesign.placement.distances import network_total_error
+from netdesign.reporting import statics
+from netdesign.reporting.mesh import feature_edges, light_mesh
+from netdesign.reporting.pages import Pictures, page
+from netdesign.reporting.record import NetworkRecord, RunRecord
+from netdesign.reporting.statics import Raster
+from netdesign.run_folder import open_run
+
+UM = 1e-6
+TRIANGLES = 20000  # of the part as it is drawn
+SCREEN_WIDTH, PAPER_DPI = 1100, 170  # px, dots per inch
+
+
+def write_report(run: Path) -> Path:
+    """Write RUN/report.html and RUN/figures/*.png from what the run holds so far; return the path of the page.
+
+    Works after ``design`` alone; what has not been validated is said to be so. The same run gives the same bytes.
+
+    Raises:
+        InputError: ``run`` is not a run directory with a design, or a file in it is damaged.
+    """
+    record = read_run(run)
+    vertices, faces = light_mesh(record.task.scene.part, TRIANGLES)
+    mesh = vertices, faces, feature_edges(vertices, faces)
+    front = Raster.of(statics.front_figure(record), PAPER_DPI)
+    write_bytes(run / "figures" / "front.png", front.png())
+    networks = {}
+    for network in record.networks:
+        picture = Raster.of(statics.network_figure(record, network, mesh), PAPER_DPI)
+        write_bytes(run / "figures" / f"network-{network.name}.png", picture.png())
+        networks[network.id] = picture.webp(SCREEN_WIDTH)
+    pictures = Pictures(front=front.webp(SCREEN_WIDTH), networks=networks, achieved=None)
+    path = run / "report.html"
+    write_text(path, page(record, mesh, pictures, study_toml(record.task.study)))
+    return path
+
+
+def read_run(run: Path) -> RunRecord:
+    """Return everything the report shows, the covariances recomputed from the poses and exact rays.
+
+    Raises:
+        InputError: ``run`` is not a run directory with a design, or a file in it is damaged.
+    """
+    task, design = open_run(run), read_design(run)
+    sight = Sight(task.scene, task.camera, task.limits)
+    networks = tuple(_network(run, task, sight, entry) for entry in design["networks"])
+    network, reason = _recommended(run)
+    return RunRecord(
+        task=task,
+        design=design,
+        networks=networks,
+        campaign=_optional(run / "validation.json", "validation"),
+        knee=network,
+        reason=reason,
+        recomputed=max(_difference(network) for network in networks),
+    )
+
+
+def _network(run: Path, task: Task, sight: Sight, entry: dict[str, Any]) -> NetworkRecord:
+    poses = poses_of(entry)
+    seen = sight.look(poses)
+    total = network_total_error(task, poses, seen.visible)
+    folder = run / "networks" / f"{entry['id']:04d}"
+    return NetworkRecord(
+        planned=entry,
+        world_from_cam=poses,
+        visible_tags=seen.visible_tags,
+        limited=total.limited,
+        total=total.covariance,
+        datum=DATUM,
+        determined=total.determined,
+        diagnosis=total.diagnosis,
+        validation=_optional(folder / "validation.json", "network-validation"),
+        repeats=tuple(
+            read_json(path, "network-validation") for path in sorted(folder.glob("repeat-*/validation.json"))
+        ),
+        adjustment=_optional(folder / "adjustment.json", "adjustment"),
+    )
+
+
+def _recommended(run: Path) -> tuple[int, str]:
+    """Return the network that ``choose`` would name, and why; the knee when the study's requirements cannot be met."""
+    try:
+        choice = choose(run)
+    except InfeasibleError as error:
+        choice = choose(run, knee=True)
+        return choice.network, f"{choice.reason}. The requirements of the study are not met: {error}"
+    return choice.network, choice.reason
+
+
+def _difference(network: NetworkRecord) -> float:
+    """Return the largest relative difference of a limited sigma between design.json and the report's own."""
+    if network.planned.get("sigma_um") is None or "limited" not in str(network.planned.get("datum", "limited")):
+        return 0.0
+    written = np.array(network.planned["sigma_um"], dtype=np.float64)
+    own = np.sqrt(np.diagonal(network.limited, axis1=1, axis2=2)) / UM
+    return float(np.nanmax(np.abs(np.where(np.isfinite(own), written / own - 1.0, 0.0))))
+
+
+def _optional(path: Path, kind: str) -> dict[str, Any] | None:
+    return read_json(path, kind) if path.is_file() else None

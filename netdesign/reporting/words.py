@@ -1,0 +1,159 @@
+"""What the report says in sentences: the headline, the captions, the glossary."""
+
+from collections import Counter
+
+import numpy as np
+
+from netdesign.reporting.record import NetworkRecord, RunRecord
+
+LIMITED_DATUM = "exterior orientation error-free (limited error propagation)"
+SHORT_DATUM = "inner constraints over all object points"
+
+RECOMPUTED = 1e-6  # largest relative difference that rounding may make between design.json and the report
+
+GLOSSARY = (
+    ("Object point", "A corner of the black square of an AprilTag; every tag has four of them, named tag.corner."),
+    (
+        "Rms sigma",
+        "The root of the mean variance over all coordinates of all object points (equation 2 of the source paper). "
+        "The largest sigma is that of the worst single coordinate.",
+    ),
+    (
+        "Limited and total propagation",
+        "Limited (or limiting) error propagation takes the poses of the cameras as error-free, which is quick to search "
+        "with; total propagation is the covariance of the full bundle adjustment with unknown poses.",
+    ),
+    (
+        "Datum",
+        "What coordinates refer to. Free network: position, orientation and scale are fixed by inner constraints over "
+        "all object points, so that a sigma says how well the shape is known; sigmas in different datums must not be "
+        "compared.",
+    ),
+    ("Front", "The networks that no other network found beats in precision, motion and number of images at once."),
+    (
+        "Lower bound, bound ratio",
+        "A proven limit below which no network of so many images can go from the admissible stations; the ratio is f1 "
+        "over that limit, so 1.10 means that at most 10 % of the variance is left to gain.",
+    ),
+    (
+        "Knee",
+        "The network farthest, in logarithms scaled to the front, on the good side of the plane through the three "
+        "best-in-one-thing corners: more precision costs much from here on, less saves little.",
+    ),
+    ("Tour", "The open path through all stations in visiting order; its length is objective f2."),
+    ("Rays", "Images that see an object point; with fewer than three a gross error cannot be found."),
+    (
+        "Ellipsoid",
+        "The surface one standard deviation away from an object point, drawn larger by the factor printed with it.",
+    ),
+    (
+        "P0, P1, P2",
+        "The same sigma predicted three times: at design with limited propagation, at design with total propagation, "
+        "and with total propagation on the image points that were really measured.",
+    ),
+    (
+        "T / ν",
+        "The squared error of all points weighted with the full predicted covariance, per degree of freedom: 1 when "
+        "noise level and geometry are both as predicted.",
+    ),
+    ("s0²", "The squared residuals of the adjustment per redundancy: 1 when the image noise is as predicted."),
+    (
+        "F",
+        "T/ν over s0²: tests the geometry alone, whatever the noise level, because a common error of the image sigma "
+        "cancels.",
+    ),
+    (
+        "ρ",
+        "The rms error really made over the rms sigma predicted: the number a user means by “is the prediction right”. "
+        "One realisation scatters, so it is judged by its interval, never by a fixed percentage.",
+    ),
+    (
+        "Coverage, NEES/3",
+        "Share of points inside their 95 % ellipsoid, and the mean squared error per coordinate in units of its "
+        "variance.",
+    ),
+    (
+        "Probability integral transform",
+        "The probability, under the prediction, of a statistic at most as large as the one found: uniform over many "
+        "networks when the predictions are right.",
+    ),
+)
+
+
+def headline(record: RunRecord) -> str:
+    """Return the title of the report: what there is to choose from."""
+    networks = record.networks
+    sizes = [network.images for network in networks]
+    best = min(record.precision_um(network) for network in networks)
+    spread = f"{min(sizes)} images" if min(sizes) == max(sizes) else f"{min(sizes)} to {max(sizes)} images"
+    count = "One camera network" if len(networks) == 1 else f"{len(networks)} camera networks"
+    return f"{count} of {spread}, down to {best:.3g} µm {record.precision_name}"
+
+
+def verdict(record: RunRecord) -> str:
+    """Return the outcome of the validation of the whole front in one or two sentences."""
+    counts = Counter(network.verdict for network in record.networks)
+    total = len(record.networks)
+    proved, failed = counts["pass"], total - counts["pass"] - counts["not validated"]
+    part = (
+        f"For “{record.task.study.name}”: {len(record.task.scene.targets.ids)} tags on the part, "
+        f"seen from a sphere of {record.task.sphere.radius * 1e3:.4g} mm radius. "
+    )
+    if proved + failed == 0:
+        return part + "Designed, not proved yet: every sigma below is a prediction."
+    text = f"{proved} of {total} networks kept what was predicted: T, F and ρ lie inside their intervals."
+    if failed:
+        text += f" {failed} did not; the reasons stand with the flags."
+    if counts["not validated"]:
+        text += f" {counts['not validated']} have not been validated."
+    return part + text
+
+
+def chip_kind(outcome: str) -> str:
+    """Return the colour class of a verdict."""
+    return {"pass": "good", "not validated": ""}.get(outcome, "bad")
+
+
+def network_flags(network: NetworkRecord) -> list[dict[str, str]]:
+    """Return everything to be said against a network; the colour says how bad it is."""
+    flags = [] if network.determined else [{"kind": "bad", "text": "Not determined by a full bundle adjustment."}]
+    reasons = (network.validation or {}).get("reasons", [])
+    flags += [{"kind": "bad", "text": str(reason)} for reason in reasons]
+    flags += [{"kind": "warn", "text": text} for text in network.warnings if text not in reasons]
+    return flags
+
+
+def all_flags(record: RunRecord) -> list[dict[str, str]]:
+    """Return the flags of every network, the notes of the search, and the report's own check."""
+    flags = []
+    for network in record.networks:
+        mine = network_flags(network)
+        if network.verdict not in ("pass", "not validated") and not any(flag["kind"] == "bad" for flag in mine):
+            mine.insert(0, {"kind": "bad", "text": f"verdict: {network.verdict}"})
+        flags += [{"kind": flag["kind"], "text": f"Network {network.name}: {flag['text']}"} for flag in mine]
+    flags.sort(key=lambda flag: flag["kind"] != "bad")
+    flags += [{"kind": "", "text": str(note)} for note in record.design.get("notes", ())]
+    if record.recomputed <= RECOMPUTED:
+        text = (
+            "Recomputed for this report from the camera poses and exact rays: every sigma agrees with design.json to "
+            f"{max(record.recomputed, 1e-16):.0e}."
+        )
+        flags.append({"kind": "good", "text": text})
+    else:
+        text = (
+            f"Recomputing the sigmas from the camera poses differs from design.json by up to {record.recomputed:.2g} "
+            "(relative): design.json and the inputs of this run do not belong together."
+        )
+        flags.insert(0, {"kind": "bad", "text": text})
+    return flags
+
+
+def ellipsoid_words(factor: float, datum: str) -> str:
+    """Return what must stand under drawn ellipsoids."""
+    size = f"{factor:,.0f}".replace(",", " ")
+    return f"one-sigma ellipsoids of the object points drawn {size} times too large, total propagation, datum: {datum}."
+
+
+def finite(value: float, digits: int = 2) -> str:
+    """Return a number for a table, a dash when it is undetermined."""
+    return f"{value:.{digits}f}" if np.isfinite(value) else "–"

@@ -1,0 +1,214 @@
+"""The report: whole without a network, nothing dropped, the same bytes each time, and its pictures obey geometry."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from netdesign.errors import InputError
+from netdesign.files.store import read_json, write_json
+from netdesign.model.scene import Part
+from netdesign.report import read_run, write_report
+from netdesign.reporting import charts, drawing, mesh, palette, payload
+from tests.runs import fail, prove, ring_run
+from tests.scenes import CAMERA, box_part, ring
+
+FAILURE = "tag 14 was found in 2 images only"
+
+
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory):
+    """A run after ``design`` alone."""
+    run = tmp_path_factory.mktemp("designed")
+    ring_run(run, sizes=(8, 10))
+    return run, write_report(run).read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def proved(tmp_path_factory):
+    """A run with one network proved, one with more noise than predicted, one that could not be adjusted."""
+    run = tmp_path_factory.mktemp("proved")
+    task = ring_run(run, sizes=(8, 10))
+    prove(run, task, networks=[0])
+    prove(run, task, networks=[1], noise=1.5)
+    fail(run, task, 2, FAILURE)
+    return run, write_report(run).read_text(encoding="utf-8")
+
+
+VOID = {"meta", "link", "img", "br", "input", "hr", "circle", "line", "rect", "polyline"}
+
+
+class Loads(HTMLParser):
+    """Collects what a page would fetch, and checks that its elements close."""
+
+    def __init__(self):
+        super().__init__()
+        self.found, self.open = [], []
+
+    def handle_starttag(self, tag, attributes):
+        for name, value in attributes:
+            if name in ("src", "href", "data", "action", "poster", "srcset"):
+                self.found.append(value)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+
+def without_plotly(page):
+    """Return the page less the plotly bundle, which quotes addresses that nothing here asks for."""
+    return re.sub(r"<script>/\*\*\n\* plotly\.js.*?</script>", "", page, flags=re.DOTALL)
+
+
+def test_the_page_loads_nothing(designed, proved):
+    for _, page in (designed, proved):
+        parser = Loads()
+        parser.feed(page)
+        assert not parser.open
+        assert all(value.startswith(("#", "data:image/")) for value in parser.found)
+        own = without_plotly(page)
+        assert len(own) < len(page) - 4e6
+        assert not re.search(r"https?:|@import|url\(", own)
+        assert page.count("plotly.js v") >= 1
+        assert len(page) < 8e6
+
+
+def test_every_network_is_in_the_table_in_detail_and_in_the_data(designed):
+    run, page = designed
+    design = read_json(run / "design.json", "design")
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page, flags=re.DOTALL)[1])
+    assert [network["id"] for network in data["networks"]] == [network["id"] for network in design["networks"]]
+    for network in design["networks"]:
+        assert '<article class="network card' in page
+        assert f'id="network-{network["id"]:04d}"' in page
+        assert f'<tr data-id="{network["id"]}"' in page
+        assert (run / "figures" / f"network-{network['id']:04d}.png").read_bytes().startswith(b"\x89PNG")
+    assert (run / "figures" / "front.png").is_file()
+    assert page.count("Designed, not proved yet") == 1
+
+
+def test_failures_and_verdicts_appear_with_their_reasons(proved):
+    run, page = proved
+    assert page.count(FAILURE) >= 2  # in its own article and among the flags
+    assert "1 of " in page
+    text = re.sub(r"<[^>]+>", " ", without_plotly(page))
+    for number in (0, 1):
+        content = read_json(run / f"networks/{number:04d}/validation.json", "network-validation")
+        assert f"{content['statistics']['rho']['value']:.3f}" in text
+        for reason in content["reasons"]:
+            assert reason in text
+    assert read_json(run / "networks/0001/validation.json", "network-validation")["reasons"]
+
+
+def test_every_sigma_has_its_datum(proved):
+    text = re.sub(r"<[^>]+>", " ", without_plotly(proved[1]))
+    assert "inner constraints over all object points" in text
+    assert "exterior orientation error-free" in text
+
+
+def test_the_same_run_gives_the_same_bytes(proved):
+    run, page = proved
+    pictures = {path.name: path.read_bytes() for path in (run / "figures").iterdir()}
+    assert write_report(run).read_text(encoding="utf-8") == page
+    assert {path.name: path.read_bytes() for path in (run / "figures").iterdir()} == pictures
+    assert str(run) not in page
+
+
+def test_names_from_the_study_cannot_break_the_page(tmp_path):
+    ring_run(tmp_path / "run", sizes=(8,))
+    study = tmp_path / "run" / "study.toml"
+    study.write_text(study.read_text().replace("box-workspace", "</script><b>&amp;"))
+    page = write_report(tmp_path / "run").read_text(encoding="utf-8")
+    parser = Loads()
+    parser.feed(page)
+    assert not parser.open
+    assert "</script><b>" not in page
+
+
+def test_sigmas_of_another_run_are_noticed(tmp_path):
+    ring_run(tmp_path / "run", sizes=(8,))
+    design = read_json(tmp_path / "run" / "design.json", "design")
+    design["networks"][0]["sigma_um"][5][1] *= 1.01
+    write_json(tmp_path / "run" / "design.json", "design", design)
+    assert read_run(tmp_path / "run").recomputed == pytest.approx(0.01, rel=1e-6)
+    assert "do not belong together" in write_report(tmp_path / "run").read_text(encoding="utf-8")
+
+
+def test_a_folder_that_is_no_run_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="run directory"):
+        write_report(tmp_path)
+
+
+def test_feature_edges_of_a_box_are_its_twelve_edges():
+    part = box_part()
+    edges = mesh.feature_edges(part.vertices, part.faces)
+    lengths = np.linalg.norm(np.diff(part.vertices[edges], axis=1)[:, 0], axis=1)
+    assert sorted(np.round(lengths, 9)) == sorted([0.24, 0.20, 0.16] * 4)
+
+
+def test_a_light_mesh_keeps_within_its_limit_and_near_the_surface():
+    steps = np.linspace(0, 2 * np.pi, 81)[:-1]
+    heights = np.linspace(-1, 1, 60)
+    vertices = np.array([[np.cos(a), np.sin(a), z] for z in heights for a in steps])
+    faces = [
+        face
+        for row in range(59)
+        for k in range(80)
+        for a, b in [(row * 80 + k, row * 80 + (k + 1) % 80)]
+        for face in ((a, b, b + 80), (a, b + 80, a + 80))
+    ]
+    part = Part(vertices=vertices, faces=faces)
+    light, triangles = mesh.light_mesh(part, 2000)
+    assert 200 < len(triangles) <= 2000
+    assert np.allclose(np.hypot(light[:, 0], light[:, 1]), 1.0)
+    assert mesh.light_mesh(part, 10**6)[1] is not None
+
+
+def test_a_projected_ellipsoid_is_the_outline_of_its_points():
+    random = np.random.default_rng(5)
+    root = random.normal(size=(3, 3))
+    view = drawing.View(azimuth=0.7, elevation=0.4)
+    assert np.allclose(view.axes @ view.axes.T, np.eye(3))
+    sphere = random.normal(size=(20000, 3))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    outline = view.flat(sphere @ root.T)
+    axes = Figure().add_subplot()
+    drawing.draw_ellipsoids(axes, view, np.zeros((1, 3)), (root @ root.T)[None], 1.0, "#000000", np.array([True]))
+    (ellipse,) = axes.collections
+    angle = np.radians(ellipse.get_angles()[0])
+    half = np.array([ellipse.get_widths()[0], ellipse.get_heights()[0]]) / 2
+    turned = outline @ np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    reach = np.linalg.norm(turned / half, axis=1)
+    assert reach.max() <= 1 + 1e-9
+    assert reach.max() > 0.9999
+
+
+def test_frusta_pass_through_the_image_corners():
+    poses = ring(3)
+    lines = drawing.frustum_lines(CAMERA, poses, 0.1)
+    assert lines.shape == (3, 8, 2, 3)
+    assert np.allclose(lines[:, :4, 0], poses[:, None, :3, 3])
+    axis = poses[:, :3, 2]
+    assert np.allclose(np.einsum("nci,ni->nc", lines[:, :4, 1] - poses[:, None, :3, 3], axis), 0.1)
+
+
+def test_interval_rows_say_inside_or_outside():
+    inside = charts.IntervalRow(label="F", note="", value=1.0, low=0.9, high=1.1)
+    outside = charts.IntervalRow(label="<T>", note="", value=1.2, low=0.9, high=1.1)
+    chart = charts.interval_chart([inside, outside], "99 %")
+    assert chart.count('class="good"') == 1
+    assert chart.count('class="bad"') == 1
+    assert "&lt;T&gt;" in chart
+    assert charts.interval_chart([], "99 %") == ""
+
+
+def test_undetermined_numbers_become_null_and_scripts_stay_closed():
+    assert payload.significant(float("inf"), 4) is None
+    assert payload.significant(123456.0, 3) == 123000.0
+    assert "</" not in payload.as_script({"name": "</script>"})
+    assert len(set(palette.ordered([3, 3, 5, 9]))) == 3

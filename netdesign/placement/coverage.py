@@ -1,0 +1,169 @@
+"""What can be seen from the viewing sphere, and what never will be: the facts behind ``netdesign check``."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+
+from netdesign.errors import InfeasibleError
+from netdesign.model.arrays import Bools, Floats
+from netdesign.model.scene import CORNERS_PER_TAG
+from netdesign.model.task import Task
+from netdesign.photogrammetry.visibility import REASONS, SEEN, sightings
+from netdesign.placement.visibility_map import VisibilityMap
+
+SAMPLE_STEP = np.radians(2.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coverage:
+    """Sightings of every tag from a grid over the sphere, and what the map proves.
+
+    Attributes:
+        tag_ids: (g,).
+        viewpoints: (c, 2) alpha, beta of the sampled viewpoints, rad, roll 0 when it is free.
+        weights: (c,) share of the admissible sphere each of them stands for, sum 1.
+        reason: (c, g) int8, index into REASONS: exact rays.
+        never: (g,) no admissible viewpoint sees the tag: proved, not sampled.
+        lonely: (g,) seen, but from nowhere together with enough others for ``min_points_per_image``: proved.
+        admissible: share of the sphere from which an image holds ``min_points_per_image`` points.
+        least_images: proven lower bound on the number of images that give every point its ``min_rays``; 0 when some
+            tag is never or lonely, so that no number is enough.
+        max_images, min_rays, min_points_per_image: of the study.
+    """
+
+    tag_ids: NDArray[np.int64]
+    viewpoints: Floats
+    weights: Floats
+    reason: NDArray[np.int8]
+    never: Bools
+    lonely: Bools
+    admissible: float
+    least_images: int
+    max_images: int
+    min_rays: int
+    min_points_per_image: int
+
+    @property
+    def share(self) -> Floats:
+        """(g,) share of the admissible sphere from which each tag is seen."""
+        return np.asarray(self.weights @ (self.reason == SEEN))
+
+    @property
+    def refusals(self) -> dict[str, int]:
+        """How many of the sampled sightings ended with each of REASONS, "seen" included."""
+        return dict(zip(REASONS, np.bincount(self.reason.ravel(), minlength=len(REASONS)).tolist(), strict=True))
+
+    @property
+    def main_reason(self) -> tuple[str, ...]:
+        """(g,) why each tag is not seen where it is not, by area; "seen" when it is seen from everywhere."""
+        shares = np.stack([self.weights @ (self.reason == k) for k in range(1, len(REASONS))])
+        worst = shares.argmax(axis=0) + 1
+        return tuple(REASONS[k] if shares[k - 1, g] > 0 else REASONS[SEEN] for g, k in enumerate(worst))
+
+    @property
+    def obstacles(self) -> tuple[str, ...]:
+        """One line for everything that makes the study infeasible; empty when nothing is proved against it."""
+        lines = []
+        unseen = np.flatnonzero(self.never)
+        if unseen.size:
+            reasons = [self.main_reason[g] for g in unseen]
+            counts = ", ".join(f"{reasons.count(name)} by {name}" for name in REASONS if name in reasons)
+            names = ", ".join(str(self.tag_ids[g]) for g in unseen[:8]) + (", …" if unseen.size > 8 else "")
+            lines.append(
+                f"{unseen.size} of {len(self.never)} tags ({CORNERS_PER_TAG * unseen.size} object points) are seen "
+                f"from no admissible viewpoint (refused mostly: {counts}): tags {names}"
+            )
+        if self.lonely.any():
+            lines.append(
+                f"visibility.min_points_per_image: {int(self.lonely.sum())} tags are seen only from viewpoints where "
+                f"fewer than {self.min_points_per_image} object points are in view"
+            )
+        if not lines and self.least_images > self.max_images:
+            lines.append(
+                f"viewpoints.max_images: at least {self.least_images} images are needed to give every object point "
+                f"{self.min_rays} rays, allowed are {self.max_images}"
+            )
+        return tuple(lines)
+
+    def demand_feasible(self) -> None:
+        """Return when nothing is proved against the study.
+
+        Raises:
+            InfeasibleError: with every one of ``obstacles``.
+        """
+        if self.obstacles:
+            raise InfeasibleError("; ".join(self.obstacles))
+
+
+def coverage(task: Task, visibility_map: VisibilityMap | None = None) -> Coverage:
+    """Sample the sphere at two degrees with exact rays, and read from the map what is proved. A second of work."""
+    scene, sphere, limits = task.scene, task.sphere, task.limits
+    if visibility_map is None:
+        visibility_map = VisibilityMap.build(scene, task.camera, sphere, limits)
+    viewpoints, weights = _sample(sphere.azimuth, sphere.elevation)
+    reason = sightings(scene, task.camera, sphere.cameras(viewpoints), limits).reason
+    possible = _distinct(visibility_map)
+    enough = possible.sum(axis=1) * CORNERS_PER_TAG >= limits.min_points_per_image
+    never: Bools = np.equal(possible.any(axis=0), False)
+    together: Bools = np.asarray(possible[enough].any(axis=0))
+    return Coverage(
+        tag_ids=scene.targets.ids,
+        viewpoints=viewpoints,
+        weights=weights,
+        reason=reason,
+        never=never,
+        lonely=~never & ~together,
+        admissible=float(weights[(reason == SEEN).sum(axis=1) * CORNERS_PER_TAG >= limits.min_points_per_image].sum()),
+        least_images=0 if not together.all() else least_images(possible[enough], limits.min_rays),
+        max_images=sphere.max_images,
+        min_rays=limits.min_rays,
+        min_points_per_image=limits.min_points_per_image,
+    )
+
+
+def least_images(possible: Bools, min_rays: int) -> int:
+    """Return a lower bound on how many rows of ``possible`` (c, g), repeats allowed, see every tag ``min_rays`` times.
+
+    Linear relaxation of the set cover, solved by HiGHS and made safe by its dual: for multipliers y >= 0 of the tags,
+    no n images can do with n · max over rows (possible @ y) < min_rays · sum(y).
+    """
+    largest = possible[~_dominated(possible)].astype(np.float64)
+    solution = linprog(
+        np.ones(len(largest)), A_ub=-largest.T, b_ub=-np.full(possible.shape[1], float(min_rays)), method="highs"
+    )
+    duals = np.maximum(-np.asarray(solution.ineqlin.marginals), 0.0)
+    reach = (possible @ duals).max()
+    bound = min_rays * duals.sum() / reach if reach > 0 else 0.0
+    return max(int(np.ceil(bound - 1e-6)), min_rays)
+
+
+def _distinct(visibility_map: VisibilityMap) -> Bools:
+    """The different rows of sure-or-maybe tags (c, g)."""
+    rows = np.unique(visibility_map.sure | visibility_map.maybe, axis=0)
+    bits = np.unpackbits(np.ascontiguousarray(rows).view(np.uint8), axis=1, bitorder="little")
+    return bits[:, : visibility_map.tag_count].astype(bool)
+
+
+def _dominated(rows: Bools) -> Bools:
+    """(c,) rows whose tags all appear in another one, among the 2000 largest; the rest counts as dominated."""
+    order = np.argsort(-rows.sum(axis=1), kind="stable")
+    dominated = np.ones(len(rows), bool)
+    kept = np.zeros((0, rows.shape[1]), bool)
+    for index in order[:2000]:
+        if not (kept | ~rows[index]).all(axis=1).any():
+            dominated[index] = False
+            kept = np.concatenate([kept, rows[index : index + 1]])
+    return dominated
+
+
+def _sample(azimuth: tuple[float, float], elevation: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Viewpoints (c, 2) in the middle of equal steps and their shares (c,) of the area."""
+    rows = max(1, round((elevation[1] - elevation[0]) / SAMPLE_STEP))
+    columns = max(1, round((azimuth[1] - azimuth[0]) / SAMPLE_STEP))
+    edges = np.linspace(*elevation, rows + 1)
+    alpha = np.linspace(*azimuth, columns + 1)[:-1] + 0.5 * (azimuth[1] - azimuth[0]) / columns
+    beta = 0.5 * (edges[1:] + edges[:-1])
+    share = np.diff(np.sin(edges)) / (np.sin(edges[-1]) - np.sin(edges[0])) / columns
+    return np.stack([np.tile(alpha, rows), np.repeat(beta, columns)], axis=1), np.repeat(share, columns)

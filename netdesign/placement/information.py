@@ -1,0 +1,188 @@
+"""How much one image can tell at most, over whole cells of the viewing sphere (kernels of ``bound``).
+
+With u the direction of the camera from the sphere's centre, p an object point relative to it, w = |p|, R the radius,
+d = p - R u and z = R - u·p, an image that looks at the centre adds to the point's normal matrix (any roll)
+
+    M(u) = omega / z⁴ · (|d|² I - d dᵀ - (p x u)(p x u)ᵀ),        omega = (focal · gain / sigma)²
+
+For a symmetric Z and Y = Z², tr(Z M Z) = omega · A(u) / z⁴ with the quadratic A(u) = a + b·u + uᵀ C u,
+
+    a = (w² + R²) tr Y - pᵀ Y p,    b = 2 R (Y - tr Y) p,    C = -R² Y - [p]ₓᵀ Y [p]ₓ.
+
+Along a great circle (|u'| = 1, u'' = -u) the second derivative of A / z⁴ is at most
+
+    ((|b| + 2 c) + 8 (|b| + c) w / z + tr Y (R + w)² (20 w² / z² + 4 w / z)) / z⁴,   z = R - w,  c = ‖C‖,
+
+so a cell whose viewpoints lie within delta of its middle admits at most value + |gradient| delta + curvature
+delta² / 2, gradients added over the points before the norm is taken. gain and sigma enter by their best in the cell.
+"""
+
+import numba
+import numpy as np
+
+from netdesign.model.arrays import Floats, Ints
+from netdesign.placement.visibility_cells import spread_angle
+
+
+@numba.njit(cache=True, error_model="numpy")
+def weight(
+    z: float, lateral: float, w: float, cosine: float, distance: float, radius: float, delta: float, gains: Floats,
+    sigmas: Floats,
+) -> float:  # fmt: skip
+    """Return the largest omega of a point within ``delta`` of a viewpoint.
+
+    Args:
+        z, lateral: depth and distance from the optical axis, m.  cosine: of the incidence.  distance: m.
+        gains: (b + 1,) squared gain of the distortion, at most, in equal steps of the radius; last: the step.
+        sigmas: (y, x) focal² / sigma², at most, over depth and cosine; last row: lowest depth, step of the depth.
+    """
+    best = 1.0
+    nearest = z - 2.0 * w * np.sin(0.5 * delta)
+    if len(gains) > 2:
+        r = lateral / z
+        shift = 2.0 * w * np.sin(0.5 * delta) * np.sqrt(1.0 + r * r) / max(nearest, 1e-9)
+        bins = len(gains) - 1
+        first = min(max(int((r - shift) / gains[bins]), 0), bins - 1)
+        last = min(max(int((r + shift) / gains[bins]), 0), bins - 1)
+        best = gains[first]
+        for k in range(first + 1, last + 1):
+            best = max(best, gains[k])
+    rows, columns = sigmas.shape[0] - 1, sigmas.shape[1]
+    if rows == 1:
+        return float(best * sigmas[0, 0])
+    sine = min(2.0 * radius * np.sin(0.5 * delta) / distance, 1.0)
+    # cos(i - spread), at most 1
+    steepest = 1.0
+    if cosine < np.sqrt(1.0 - sine * sine):
+        steepest = cosine * np.sqrt(1.0 - sine * sine) + np.sqrt(max(1.0 - cosine * cosine, 0.0)) * sine
+    row = min(max(int((nearest - sigmas[rows, 0]) / sigmas[rows, 1]), 0), rows - 1)
+    column = min(max(int(steepest * columns), 0), columns - 1)
+    return float(best * sigmas[row, column])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def normal_matrices(
+    cells: Ints, grid: Floats, bits: Ints, radius: float, points: Floats, normals: Floats, gains: Floats, sigmas: Floats
+) -> Floats:
+    """Return (c, m, 6): xx, xy, xz, yy, yz, zz of M in the middle of each cell, omega at its best, 0 where no bit is.
+
+    Args:
+        cells: (c,) of the map with ``grid``.  bits: (cells, words) of the tags that count.
+        points, normals: (m, 3), points relative to the sphere's centre.
+    """
+    matrices = np.zeros((len(cells), len(points), 6))
+    columns = int(grid[2])
+    half_alpha, half_beta = 0.5 / grid[1], 0.5 / grid[4]
+    for index in range(len(cells)):
+        cell = cells[index]
+        alpha = grid[0] + (cell % columns + 0.5) / grid[1]
+        beta = grid[3] + (cell // columns + 0.5) / grid[4]
+        ux, uy, uz = np.cos(beta) * np.cos(alpha), np.cos(beta) * np.sin(alpha), np.sin(beta)
+        delta = spread_angle(beta, half_alpha, half_beta)
+        for j in range(len(points)):
+            tag = j >> 2
+            if not (bits[cell, tag >> 6] >> np.uint64(tag & 63)) & np.uint64(1):
+                continue
+            px, py, pz = points[j, 0], points[j, 1], points[j, 2]
+            z = radius - (ux * px + uy * py + uz * pz)
+            dx, dy, dz = px - radius * ux, py - radius * uy, pz - radius * uz
+            cx, cy, cz = py * uz - pz * uy, pz * ux - px * uz, px * uy - py * ux
+            square = dx * dx + dy * dy + dz * dz
+            distance, lateral = np.sqrt(square), np.sqrt(cx * cx + cy * cy + cz * cz)
+            cosine = -(dx * normals[j, 0] + dy * normals[j, 1] + dz * normals[j, 2]) / distance
+            w = np.sqrt(px * px + py * py + pz * pz)
+            scale = weight(z, lateral, w, cosine, distance, radius, delta, gains, sigmas) / z**4
+            matrices[index, j, 0] = scale * (square - dx * dx - cx * cx)
+            matrices[index, j, 1] = scale * (-dx * dy - cx * cy)
+            matrices[index, j, 2] = scale * (-dx * dz - cx * cz)
+            matrices[index, j, 3] = scale * (square - dy * dy - cy * cy)
+            matrices[index, j, 4] = scale * (-dy * dz - cy * cz)
+            matrices[index, j, 5] = scale * (square - dz * dz - cz * cz)
+    return matrices
+
+
+@numba.njit(cache=True, error_model="numpy")
+def largest_gains(
+    cells: Ints, grid: Floats, parts: int, bits: Ints, radius: float, points: Floats, normals: Floats, forms: Floats,
+    gains: Floats, sigmas: Floats,
+) -> Floats:  # fmt: skip
+    """Return (c,) upper bounds of Σ tr(Z_j M_j(u) Z_j) over every viewpoint of each cell.
+
+    Args:
+        parts: every cell is cut into parts x parts, each bounded by itself.
+        forms: (m, 11) a, b, the upper triangle of C, and the curvature of ``quadratic_forms``.
+        Others: as in ``normal_matrices``.
+    """
+    result = np.zeros(len(cells))
+    columns = int(grid[2])
+    half_alpha, half_beta = 0.5 / (grid[1] * parts), 0.5 / (grid[4] * parts)
+    for index in range(len(cells)):
+        cell = cells[index]
+        for part in range(parts * parts):
+            alpha = grid[0] + (cell % columns + (part % parts + 0.5) / parts) / grid[1]
+            beta = grid[3] + (cell // columns + (part // parts + 0.5) / parts) / grid[4]
+            ux, uy, uz = np.cos(beta) * np.cos(alpha), np.cos(beta) * np.sin(alpha), np.sin(beta)
+            delta = spread_angle(beta, half_alpha, half_beta)
+            value = curvature = gx = gy = gz = 0.0
+            for tag in range(len(points) // 4):
+                if not (bits[cell, tag >> 6] >> np.uint64(tag & 63)) & np.uint64(1):
+                    continue
+                for j in range(4 * tag, 4 * tag + 4):
+                    px, py, pz = points[j, 0], points[j, 1], points[j, 2]
+                    up = ux * px + uy * py + uz * pz
+                    z = radius - up
+                    cx = forms[j, 4] * ux + forms[j, 5] * uy + forms[j, 6] * uz
+                    cy = forms[j, 5] * ux + forms[j, 7] * uy + forms[j, 8] * uz
+                    cz = forms[j, 6] * ux + forms[j, 8] * uy + forms[j, 9] * uz
+                    a = forms[j, 0] + forms[j, 1] * ux + forms[j, 2] * uy + forms[j, 3] * uz
+                    a += cx * ux + cy * uy + cz * uz
+                    scale = sigmas[0, 0]
+                    if len(gains) > 2 or len(sigmas) > 2:
+                        square = px * px + py * py + pz * pz
+                        distance = np.sqrt(square + radius * radius - 2.0 * radius * up)
+                        facing = radius * (ux * normals[j, 0] + uy * normals[j, 1] + uz * normals[j, 2])
+                        facing -= px * normals[j, 0] + py * normals[j, 1] + pz * normals[j, 2]
+                        lateral = np.sqrt(max(square - up * up, 0.0))
+                        scale = weight(
+                            z, lateral, np.sqrt(square), facing / distance, distance, radius, delta, gains, sigmas
+                        )
+                    inverse = 1.0 / z
+                    scale *= inverse * inverse * inverse * inverse
+                    steep = 4.0 * a * inverse
+                    value += scale * a
+                    gx += scale * (forms[j, 1] + 2.0 * cx + steep * px)
+                    gy += scale * (forms[j, 2] + 2.0 * cy + steep * py)
+                    gz += scale * (forms[j, 3] + 2.0 * cz + steep * pz)
+                    curvature += scale * z**4 * forms[j, 10]
+            radial = gx * ux + gy * uy + gz * uz
+            slope = np.sqrt(max(gx * gx + gy * gy + gz * gz - radial * radial, 0.0))
+            result[index] = max(result[index], value + slope * delta + 0.5 * curvature * delta * delta)
+    return result
+
+
+def quadratic_forms(squares: Floats, points: Floats, radius: float) -> Floats:
+    """Return (m, 11): a, b (3), C as xx xy xz yy yz zz, and the bound on the second derivative, per point.
+
+    Args:
+        squares: (m, 3, 3) Y = Z².  points: (m, 3) relative to the sphere's centre.
+    """
+    trace = np.trace(squares, axis1=1, axis2=2)
+    size = np.linalg.norm(points, axis=1)
+    image = np.einsum("mij,mj->mi", squares, points)
+    constant = trace * (size**2 + radius**2) - np.einsum("mi,mi->m", points, image)
+    linear = 2.0 * radius * (image - trace[:, None] * points)
+    # Columns of [p]ₓ are p x e_k, so that p x u = [p]ₓ u.
+    cross = np.cross(points[:, None, :], np.eye(3)[None]).swapaxes(1, 2)
+    quadratic = -(radius**2) * squares - np.einsum("mki,mkl,mlj->mij", cross, squares, cross)
+    norm = np.linalg.norm(quadratic, axis=(1, 2), ord=2) if len(points) else np.zeros(0)
+    depth = radius - size
+    ratio = size / depth
+    slope = np.linalg.norm(linear, axis=1)
+    curvature = (
+        slope
+        + 2.0 * norm
+        + 8.0 * (slope + norm) * ratio
+        + trace * (radius + size) ** 2 * (20.0 * ratio**2 + 4.0 * ratio)
+    ) / depth**4
+    upper = quadratic[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return np.ascontiguousarray(np.column_stack([constant, linear, upper, curvature]))

@@ -9,7 +9,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-APT_PACKAGES := libegl1 libgl1 python3-venv
+APT_PACKAGES := libegl1 libgl1 libgomp1 python3-venv
+LIBRARIES := libEGL.so.1 libGL.so.1 libgomp.so.1
 APT_LINE := apt-get update && apt-get install -y --no-install-recommends $(APT_PACKAGES)
 
 .PHONY: demo test slowtest quicktest lint setup lock clean
@@ -34,11 +35,11 @@ lint: setup
 
 setup: $(VENV)/.installed
 
-# The virtual environment, and the two libraries that drawing without a display needs: libEGL and libGL (Mesa).
+# The virtual environment, and what it cannot bring: libEGL and libGL (Mesa) to draw without a display, OpenMP.
 $(VENV)/.made:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo 'netdesign needs Python 3.11 or newer; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)'; exit 1; }
-	@if $(PYTHON) -c 'import ctypes, ensurepip; [ctypes.CDLL(name) for name in ("libEGL.so.1", "libGL.so.1")]' 2> /dev/null; \
+	@if $(PYTHON) -c 'import ctypes, ensurepip; [ctypes.CDLL(name) for name in "$(LIBRARIES)".split()]' 2> /dev/null; \
 	then true; \
 	elif [ "$$(id -u)" = 0 ] && command -v apt-get > /dev/null; then $(APT_LINE); \
 	else echo 'Missing system packages. As root, run:  $(APT_LINE)'; exit 1; fi
@@ -49,7 +50,7 @@ $(VENV)/.made:
 $(VENV)/.locked: constraints.txt $(VENV)/.made
 	awk '/^[a-z]/ { keep = /^setuptools==/ } keep' constraints.txt > $(VENV)/build.txt
 	$(BIN)/python -m pip install --quiet --require-hashes -r $(VENV)/build.txt
-	$(BIN)/python -m pip install --quiet --require-hashes --no-build-isolation -r constraints.txt
+	$(BIN)/python -m pip install --quiet --require-hashes --no-build-isolation --use-pep517 -r constraints.txt
 	@touch $@
 
 $(VENV)/.installed: pyproject.toml $(VENV)/.locked

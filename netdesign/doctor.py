@@ -27,6 +27,13 @@ COMPILED = {
     "pin": "pinocchio",
     "moocore": "moocore",
 }
+# Debian's and Ubuntu's packages of the shared libraries that wheels do not bring.
+DEBIAN_PACKAGES = {
+    "libgomp.so": "libgomp1",
+    "libEGL.so": "libegl1",
+    "libGL.so": "libgl1",
+    "libXrender.so": "libxrender1",
+}
 TOLERANCE_PX = 0.02  # a wrong pixel convention is off by 0.5 px, the fit itself by a few thousandths
 
 
@@ -131,8 +138,9 @@ def _libraries() -> list[Check]:
             importlib.import_module(module)
         except (ImportError, OSError) as error:
             reason = " ".join(str(error).split())
-            advice = "a shared library of the system is missing" if ".so" in reason else "install netdesign again"
-            failed.append(Check(name=f"import {module}", good=False, found=reason, advice=f"{distribution}: {advice}"))
+            missing = [package for library, package in DEBIAN_PACKAGES.items() if library in reason]
+            advice = f"apt-get install {' '.join(missing)}" if missing else f"install {distribution} again"
+            failed.append(Check(name=f"import {module}", good=False, found=reason, advice=advice))
     return failed or [Check(name="compiled libraries", good=True, found=f"{len(COMPILED)} load")]
 
 

@@ -7,6 +7,7 @@ or dominated is dropped and counted.
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.progress import Progress, silent
 from netdesign.model.results import Design, DesignedNetwork, PointPrecision, SearchHistory, Tour
 from netdesign.model.task import Task
+from netdesign.motion.plan import plan_on
 from netdesign.motion.tour import open_path
 from netdesign.photogrammetry.limited_error import limited_covariance
 from netdesign.photogrammetry.precision import sighting_sigma
@@ -122,11 +124,10 @@ class Exact:
         sphere = self.problem.task.sphere
         task = self.problem.task
         if self.problem.joint_map is not None:
-            from netdesign.motion.plan import plan as plan_motion
-
-            plan = plan_motion(task.cell, sphere, task.scene.part, viewpoints, task.study.motion, task.study.seed)
+            motion: Literal["joint", "time"] = "time" if task.study.motion == "time" else "joint"
+            plan = plan_on(self.problem.joint_map, viewpoints, motion, task.study.seed)
             if plan.tour is None:
-                return f"out of the robot's reach ({'; '.join(sorted(set(plan.refused)))})"
+                return f"a station the robot cannot take ({', '.join(sorted({reason for _, reason in plan.refused}))})"
             return plan.viewpoints, plan.world_from_cam, plan.tour, plan.warnings
         positions = sphere.cameras(viewpoints)[:, :3, 3]
         order, _ = open_path(np.linalg.norm(positions[:, None] - positions[None], axis=2), task.study.seed)

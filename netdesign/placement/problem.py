@@ -9,6 +9,7 @@ import numpy as np
 
 from netdesign.errors import InfeasibleError
 from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.frames import sphere_directions
 from netdesign.model.progress import Progress, silent
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
@@ -18,7 +19,14 @@ from netdesign.photogrammetry.limited_error import blocked
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.placement.coverage import coverage
 from netdesign.placement.encoding import Chromosomes
-from netdesign.placement.evaluation import MAX_SIGMA, MEAN_VARIANCE, JointTables, SphereTables, evaluate_networks
+from netdesign.placement.evaluation import (
+    MAX_SIGMA,
+    MEAN_VARIANCE,
+    JointTables,
+    SphereTables,
+    evaluate_networks,
+    motion_objective,
+)
 from netdesign.placement.set_cover import CANDIDATES, Cover, lattice, smallest_cover
 from netdesign.placement.visibility_map import VisibilityMap
 from netdesign.search.population import Population, evaluated
@@ -47,7 +55,7 @@ class Problem:
     joint: JointTables | None
     cover: Cover
     scale: Floats
-    threads: int = field(default_factory=lambda: int(numba.config.NUMBA_NUM_THREADS))
+    threads: int = field(default_factory=lambda: int(numba.get_num_threads()))
 
     @staticmethod
     def build(task: Task, progress: Progress = silent) -> "Problem":
@@ -77,7 +85,7 @@ class Problem:
             tables=tables,
             joint=joint,
             cover=cover,
-            scale=_scale(task, tables, slots),
+            scale=_scale(task, tables, joint, slots),
         )
         progress("set cover", 3, 3)
         return problem
@@ -233,12 +241,19 @@ def _cover(task: Task, visibility: VisibilityMap, joint_map: JointMap | None, ta
     return cover
 
 
-def _scale(task: Task, tables: SphereTables, slots: int) -> Floats:
-    """Ideal and reference point of the hypervolume: from the closed-form bound of ``slots`` images to 100 times it."""
+def _scale(task: Task, tables: SphereTables, joint: JointTables | None, slots: int) -> Floats:
+    """Ideal and reference point of the hypervolume.
+
+    log f1 from the closed-form bound of ``slots`` images to 100 times it; f2 from 0 to the longest tour over ``slots``
+    random stations in 20 samples; f3 from 1 to slots + 1.
+    """
     bound = 1.5 * tables.variance * (task.sphere.radius**2) / slots
-    step = task.sphere.radius if task.study.motion == "workspace" else 1.5 if task.study.motion == "joint" else 3.0
+    samples = Chromosomes(sphere=task.sphere, slots=slots).uniform(np.random.default_rng(0), (20, slots))
+    longest = max(
+        motion_objective(viewpoints, sphere_directions(viewpoints), tables, joint)[0] for viewpoints in samples
+    )
     if tables.criterion == MAX_SIGMA:
         ideal, reference = 0.5 * np.log(bound), 0.5 * np.log(100 * bound)
     else:
         ideal, reference = np.log(bound), np.log(100 * bound)
-    return np.array([[ideal, 0.0, 1.0], [reference, step * np.sqrt(2 * slots), slots + 1.0]])
+    return np.array([[ideal, 0.0, 1.0], [reference, max(longest, 1e-9), slots + 1.0]])

@@ -20,12 +20,14 @@ NOT_DETERMINED_FLAT = 10.0  # the same for a flat object seen without roll, wher
 ROLL_ALIKE = 0.97  # mean resultant length of the roll angles above which all images are rolled alike
 
 
-def point_complaints(problem: BundleProblem, layout: Layout, reduced: Reduced) -> tuple[str, ...]:
+def point_complaints(problem: BundleProblem, layout: Layout, reduced: Reduced, weakness: Floats) -> tuple[str, ...]:
     """Return the points whose rays are parallel, or so nearly parallel that the distance is noise.
 
     Two images at one position and nothing else is the common cause.
+
+    Args:
+        weakness: (m,) of ``depth_weakness``.
     """
-    weakness = depth_weakness(problem, layout, reduced)
     bad = layout.eliminated & ((reduced.point_condition < POINT_CONDITION) | (weakness > HOPELESS_DEPTH))
     weak = weakness > WEAK_DEPTH
     if weak.sum() > WEAK_SHARE * layout.eliminated.sum():

@@ -26,7 +26,11 @@ from netdesign.photogrammetry.reliability import redundancy_matrices, redundancy
 
 
 def estimate(
-    problem: BundleProblem, robust: bool = False, significance: float = 1e-3, joint: bool = False
+    problem: BundleProblem,
+    robust: bool = False,
+    significance: float = 1e-3,
+    joint: bool = False,
+    sigma_known: bool = True,
 ) -> Adjustment:
     """Adjust a bundle.
 
@@ -34,6 +38,7 @@ def estimate(
         robust: start with Cauchy weights and remove gross errors by a w-test before the least-squares solution.
         significance: of the outlier test.
         joint: also form the joint covariance of all points.
+        sigma_known: False when the covariances of the image points are a guess; the outlier test then scales itself.
 
     Raises:
         InputError: values that are no numbers, observations given twice, a datum without what carries it.
@@ -48,7 +53,7 @@ def estimate(
     dropped: tuple[int, ...] = ()
     before = 0
     if robust:
-        scaled, rejected, dropped, before = cleaned(scaled, significance)
+        scaled, rejected, dropped, before = cleaned(scaled, significance, sigma_known)
     try:
         solution = anchored(solve(scaled), start)
     except InfeasibleError as error:
@@ -111,7 +116,13 @@ def appraise(
             "parameters open; expected at least 3 that do not lie on one line"
         )
     parameter_names = _parameter_names(problem)
-    complaints = point_complaints(problem, layout, reduced)
+    unknowns = layout.width + 3 * int(layout.eliminated.sum())
+    measured = _measured(problem, layout)
+    redundancy = measured - unknowns + open_
+    sigma0 = float(np.sqrt(solution.cost / redundancy)) if redundancy > 0 else float("nan")
+    # With enough redundancy the residuals know the noise better than an assumption does.
+    weakness = depth_weakness(problem, layout, reduced) * (sigma0 if redundancy >= 20 else 1.0)
+    complaints = point_complaints(problem, layout, reduced, weakness)
     if complaints:
         raise InfeasibleError("; ".join(complaints))
     camera_side = invert_camera_side(reduced, g_camera, solution.constraints)
@@ -131,13 +142,6 @@ def appraise(
         raise InfeasibleError("; ".join(complaints))
     red = redundancy_matrices(linearised, reduced, camera_side.inverse)
     numbers = redundancy_numbers(red)
-    control, bars = problem.active_control, problem.active_bars
-    measured = 2 * len(problem.observations)
-    measured += 0 if control is None else 3 * int((control.sigma > 0).sum())
-    measured += 0 if bars is None else len(bars.a)
-    measured += 0 if problem.active_priors is None else 6 * layout.images
-    unknowns = layout.width + 3 * int(layout.eliminated.sum())
-    redundancy = measured - unknowns + open_
     used = layout.eliminated | layout.kept | problem.known()
     point_covariance = covariance.points * unit**2
     point_covariance[~used] = np.inf
@@ -150,7 +154,6 @@ def appraise(
     poses = problem.world_from_cam.copy()
     poses[:, :3, 3] = poses[:, :3, 3] * unit + centre
     projected = np.einsum("kij,kj->ki", np.linalg.inv(whitener(problem.observations.covariance)), linearised.residual)
-    sigma0 = float(np.sqrt(solution.cost / redundancy)) if redundancy > 0 else float("nan")
     adjustment = Adjustment(
         world_from_cam=poses,
         points=problem.points * unit + centre,
@@ -177,8 +180,16 @@ def appraise(
         lambda8=camera_side.first_eigenvalue,
         rejected=rejected,
     )
-    weakness = depth_weakness(problem, layout, reduced)
     return replace(adjustment, warnings=quality_warnings(problem, adjustment, dropped, weakness))
+
+
+def _measured(problem: BundleProblem, layout: Layout) -> int:
+    """Return the number of measured values: image coordinates, weighted control coordinates, lengths, priors."""
+    control, bars = problem.active_control, problem.active_bars
+    count = 2 * len(problem.observations)
+    count += 0 if control is None else 3 * int((control.sigma > 0).sum())
+    count += 0 if bars is None else len(bars.a)
+    return count + (0 if problem.active_priors is None else 6 * layout.images)
 
 
 def _parameter_names(problem: BundleProblem) -> tuple[str, ...]:

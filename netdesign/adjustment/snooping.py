@@ -26,19 +26,30 @@ CONTROLLED = 3  # rays that an object point needs for its errors to be found
 
 
 def cleaned(
-    problem: BundleProblem, significance: float
+    problem: BundleProblem, significance: float, sigma_known: bool = True
 ) -> tuple[BundleProblem, tuple[Rejection, ...], tuple[int, ...], int]:
     """Return the problem without gross errors, what was rejected, the points that were dropped, and iterations spent.
+
+    Args:
+        sigma_known: False when the covariances are a guess; the level of the noise is then taken from the residuals.
 
     Raises:
         InfeasibleError: more than half of the image points would have to go.
     """
-    everything = problem.observations
+    original = problem.observations
     limit = float(chi2.isf(significance, 2))
     robust = solve(problem, robust=True)
     iterations = robust.iterations
+    if not sigma_known:
+        for _ in range(3):
+            guess = _robust_variance((robust.linearised.residual**2).sum(axis=1), robust.problem)
+            observations = replace(problem.observations, covariance=problem.observations.covariance * guess)
+            problem = replace(problem, observations=observations)
+            robust = solve(replace(robust.problem, observations=observations), robust=True)
+            iterations += robust.iterations
+    everything = problem.observations
     squared = (robust.linearised.residual**2).sum(axis=1)
-    level = _variance_level(squared, 2 * len(squared), problem)
+    level = _variance_level(squared, problem)
     keep = _with_enough_rays(problem, squared <= SUSPECT * level)
     statistic = squared / level
     start = robust.problem
@@ -77,7 +88,7 @@ def cleaned(
         Rejection(image=int(everything.image[k]), point=int(everything.point[k]), statistic=float(statistic[k]))
         for k in np.flatnonzero(lost)
     )
-    return replace(start, observations=everything.select(keep)), rejections, dropped, iterations
+    return replace(start, observations=original.select(keep)), rejections, dropped, iterations
 
 
 def _with_enough_rays(problem: BundleProblem, keep: Bools) -> Bools:
@@ -89,16 +100,23 @@ def _with_enough_rays(problem: BundleProblem, keep: Bools) -> Bools:
     return keep & ~short[point]
 
 
-def _variance_level(squared: Floats, count: int, problem: BundleProblem) -> float:
-    """Return the robust variance factor of the residuals, 1 when the a-priori sigma is not contradicted.
+def _robust_variance(squared: Floats, problem: BundleProblem) -> float:
+    """Return the variance factor of squared whitened residuals (k,), from their median.
 
-    Median of squared whitened residuals over its expectation, 2 ln 2 times the mean redundancy number; a factor
-    below 1 is not used: it would reject good image points.
+    The median of chi² (2) is 2 ln 2; residuals are smaller than errors by the mean redundancy number.
     """
     layout = problem.layout()
     unknowns = layout.width + 3 * int(layout.eliminated.sum()) - null_space(problem, layout)[0].shape[1]
-    share = max(1.0 - unknowns / count, 0.05)
-    level = float(np.median(squared)) / (2.0 * np.log(2.0) * share)
+    share = max(1.0 - unknowns / (2 * len(squared)), 0.05)
+    return float(max(np.median(squared) / (2.0 * np.log(2.0) * share), 1e-12))
+
+
+def _variance_level(squared: Floats, problem: BundleProblem) -> float:
+    """Return the variance factor that tests are scaled by: 1 unless the residuals clearly say more.
+
+    Less is never used: it would reject good image points.
+    """
+    level = _robust_variance(squared, problem)
     # The median of k squares has a relative deviation of about 1.44/sqrt(k): four of these are chance.
     return level if level > 1.0 + 6.0 / np.sqrt(len(squared)) else 1.0
 
@@ -112,7 +130,7 @@ def _tests(solution: Solution) -> tuple[Floats, float]:
     camera_side = invert_camera_side(reduced, gauge, solution.constraints)
     red = redundancy_matrices(linearised, reduced, camera_side.inverse)
     squared = (linearised.residual**2).sum(axis=1)
-    level = _variance_level(squared, 2 * len(squared), problem)
+    level = _variance_level(squared, problem)
     return w_statistic(linearised.residual, red) / level, level
 
 

@@ -268,10 +268,11 @@ def _warnings(network: dict[str, Any], row: FrontRow, asked: tuple[dict[str, Any
 
 
 def _verdict(run: Path, network: int) -> str:
-    path = run / "networks" / f"{network:04d}" / "validation.json"
-    return (
-        str(read_json(path, "network-validation").get("verdict", "no verdict")) if path.is_file() else "not validated"
-    )
+    """Return the worst verdict over the realisations of a network: failed, fail or pass."""
+    folder = run / "networks" / f"{network:04d}"
+    paths = [folder / "validation.json", *sorted(folder.glob("repeat-*/validation.json"))]
+    found = [read_json(path, "network-validation")["verdict"] for path in paths if path.is_file()]
+    return next((verdict for verdict in ("failed", "fail", "pass") if verdict in found), "not validated")
 
 
 def _index(networks: list[dict[str, Any]], network: int) -> int:

@@ -43,7 +43,15 @@ def write_report(run: Path) -> Path:
         picture = Raster.of(statics.network_figure(record, network, mesh), PAPER_DPI)
         write_bytes(run / "figures" / f"network-{network.name}.png", picture.png())
         networks[network.id] = picture.webp(SCREEN_WIDTH)
-    pictures = Pictures(front=front.webp(SCREEN_WIDTH), networks=networks, achieved=None)
+    achieved = statics.achieved_figure(record)
+    proof = None if achieved is None else Raster.of(achieved, PAPER_DPI)
+    if proof is not None:
+        write_bytes(run / "figures" / "achieved.png", proof.png())
+    pictures = Pictures(
+        front=front.webp(SCREEN_WIDTH),
+        networks=networks,
+        achieved=None if proof is None else proof.webp(SCREEN_WIDTH * 2 // 3),
+    )
     path = run / "report.html"
     write_text(path, page(record, mesh, pictures, study_toml(record.task.study)))
     return path

@@ -9,11 +9,12 @@ import tomli_w
 import trimesh
 
 from netdesign.adjustment.bundle import adjust
+from netdesign.adjustment.campaign import pool
 from netdesign.adjustment.compare import compare
-from netdesign.files.adjustment import adjustment_payload, validation_payload
+from netdesign.files.adjustment import adjustment_payload, campaign_member, campaign_payload, validation_payload
 from netdesign.files.design_json import read_networks, write_design
 from netdesign.files.parts import TAG_COLUMNS
-from netdesign.files.store import write_json
+from netdesign.files.store import read_json, write_json
 from netdesign.files.study import load_task
 from netdesign.model.frames import exp_rotation, look_at, pose, sphere_directions
 from netdesign.model.network import Observations
@@ -191,3 +192,11 @@ def fail(run, task, network, reason):
         "warnings": [],
     }
     write_json(run / f"networks/{network:04d}/validation.json", "network-validation", record, task.sha256)
+
+
+def pool_run(run, task):
+    """Write RUN/validation.json from the networks that were adjusted."""
+    paths = sorted((run / "networks").glob("*/validation.json"))
+    records = [read_json(path, "network-validation") for path in paths]
+    members = [campaign_member(f"{item['network']:04d}", item) for item in records if item["verdict"] != "failed"]
+    write_json(run / "validation.json", "validation", campaign_payload(pool(members)), task.sha256)

@@ -13,7 +13,7 @@ from netdesign.files.store import read_json, write_json
 from netdesign.model.scene import Part
 from netdesign.report import read_run, write_report
 from netdesign.reporting import charts, drawing, mesh, palette, payload
-from tests.runs import fail, prove, ring_run
+from tests.runs import fail, pool_run, prove, ring_run
 from tests.scenes import CAMERA, box_part, ring
 
 FAILURE = "tag 14 was found in 2 images only"
@@ -35,6 +35,7 @@ def proved(tmp_path_factory):
     prove(run, task, networks=[0])
     prove(run, task, networks=[1], noise=1.5)
     fail(run, task, 2, FAILURE)
+    pool_run(run, task)
     return run, write_report(run).read_text(encoding="utf-8")
 
 
@@ -103,6 +104,10 @@ def test_failures_and_verdicts_appear_with_their_reasons(proved):
         for reason in content["reasons"]:
             assert reason in text
     assert read_json(run / "networks/0001/validation.json", "network-validation")["reasons"]
+    campaign = read_json(run / "validation.json", "validation")
+    assert campaign["statement"] in text
+    assert f"{campaign['achieved_over_predicted']['total']:.3f}" in text
+    assert (run / "figures" / "achieved.png").is_file()
 
 
 def test_every_sigma_has_its_datum(proved):

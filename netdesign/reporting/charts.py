@@ -58,6 +58,56 @@ def interval_chart(rows: Sequence[IntervalRow], level: str) -> Markup:
     return _svg(width, bottom + 20, parts, f"Statistics inside their {level} intervals")
 
 
+@dataclass(frozen=True, kw_only=True)
+class BandRow:
+    """An estimate with its confidence interval, and the margin it must stay in."""
+
+    label: str
+    note: str
+    value: float
+    low: float
+    high: float
+    margin: tuple[float, float]
+
+    @property
+    def inside(self) -> bool:
+        """Whether the whole interval lies in the margin."""
+        return self.margin[0] <= self.low and self.high <= self.margin[1]
+
+
+def band_chart(rows: Sequence[BandRow]) -> Markup:
+    """Return a row per estimate: the margin as a bar, the confidence interval as a line, the estimate as a dot."""
+    if not rows:
+        return Markup("")
+    low = min(min(row.low, row.margin[0]) for row in rows) - 0.03
+    high = max(max(row.high, row.margin[1]) for row in rows) + 0.03
+    width, left, right, step, top = 500, 118, 110, 36, 10
+
+    def at(value: float) -> float:
+        return left + (value - low) / (high - low) * (width - left - right)
+
+    bottom = top + step * len(rows)
+    parts = [
+        f'<line class="axis" x1="{at(tick):.1f}" x2="{at(tick):.1f}" y1="{top}" y2="{bottom}"/>'
+        f'<text class="tick" x="{at(tick):.1f}" y="{bottom + 14}" text-anchor="middle">{tick:g}</text>'
+        for tick in _ticks(max(low, 1e-3), high)
+    ]
+    for index, row in enumerate(rows):
+        y = top + step * (index + 0.5)
+        state = "good" if row.inside else "bad"
+        parts.append(
+            f'<text class="label" x="0" y="{y + 1:.1f}">{escape(row.label)}</text>'
+            f'<text class="tick" x="0" y="{y + 13:.1f}">{escape(row.note)}</text>'
+            f'<rect class="range" x="{at(row.margin[0]):.1f}" y="{y - 8:.1f}" height="16" rx="3" '
+            f'width="{at(row.margin[1]) - at(row.margin[0]):.1f}"/>'
+            f'<line class="whisker {state}" x1="{at(row.low):.1f}" x2="{at(row.high):.1f}" y1="{y:.1f}" y2="{y:.1f}"/>'
+            f'<circle class="{state}" cx="{at(row.value):.1f}" cy="{y:.1f}" r="5"/>'
+            f'<text class="value {state}" x="{width - right + 12}" y="{y + 4:.1f}">{row.value:.3f} '
+            f"{'✓' if row.inside else '✗'}</text>"
+        )
+    return _svg(width, bottom + 20, parts, "Estimates with 90 % intervals inside their margins")
+
+
 def dot_chart(rows: Sequence[tuple[str, str, float, str]], unit: str) -> Markup:
     """Return a bar from zero per (label, note, value, class): a few numbers side by side."""
     values = [value for _, _, value, _ in rows if isfinite(value)]

@@ -2,8 +2,10 @@
 
 from typing import Any
 
+from markupsafe import Markup
+
 from netdesign.reporting import charts, words
-from netdesign.reporting.record import NetworkRecord
+from netdesign.reporting.record import NetworkRecord, RunRecord
 
 Values = dict[str, Any]
 
@@ -88,3 +90,95 @@ def scatter(network: NetworkRecord) -> Values | None:
         "achieved": float(content["achieved_rms_um"]),
         "pass": bool(content["passed"]),
     }
+
+
+def campaign(record: RunRecord) -> Values | None:
+    """Return what the page shows of all networks together; None when nothing has been validated."""
+    validated = [network for network in record.networks if network.validation is not None]
+    if not validated:
+        return None
+    content = record.campaign or {}
+    failed = [network.name for network in validated if scatter(network) is None]
+    verdicts = []
+    if "statement" in content:
+        verdicts.append({"kind": "good" if content["equivalent"] else "bad", "text": content["statement"]})
+    if failed:
+        verdicts.append({"kind": "bad", "text": f"Not in these figures, because they failed: {', '.join(failed)}."})
+    counted = len(record.networks) - len(validated)
+    if counted:
+        verdicts.append({"kind": "warn", "text": f"Not validated yet: {counted} of {len(record.networks)} networks."})
+    return {
+        "lead": f"{len(validated)} of {len(record.networks)} networks of the front were rendered, measured and "
+        "adjusted. One network alone cannot confirm a prediction to ten per cent; all of them together can.",
+        "verdicts": verdicts,
+        "pooled": charts.interval_chart(interval_rows(content.get("statistics", {})), "99 %"),
+        "pooled_caption": "All networks as one: T, s0² and F from summed squares, each in its exact 99 % interval.",
+        "margins": charts.band_chart(_bands(content)),
+        "margins_caption": "The decision is one of equivalence: the 90 % interval (line) has to lie inside the margin "
+        "(bar). ρ: geometric mean of achieved over predicted (P2). √F: the geometry alone.",
+        "ratios": _ratios(content),
+        "pits": _histograms(content),
+        "pit_caption": "The probability integral transforms of all networks. If every prediction is right they are "
+        "uniform: bars within the shaded 95 % band. p: Kolmogorov and Smirnov's test of it.",
+        "repeats": [
+            f"Network {name}: {item['count']} realisations, {100 * max(item['bias_share'], 0):.1f} % of the mean "
+            "squared error is common to all of them (bias), the rest is noise."
+            for name, item in sorted(content.get("repeats", {}).items())
+        ],
+        "scatter_caption": "Each dot is a network: the rms error really made against the rms sigma predicted for the "
+        f"image points used (P2), datum: {words.SHORT_DATUM}. Dashed: equal; shaded: ten per cent. Crosses: outside "
+        "their own intervals." + _trend(content),
+    }
+
+
+def _bands(content: Values) -> list[charts.BandRow]:
+    rows = (("rho", "ρ", "geometric mean"), ("root_f", "√F", "geometry alone"))
+    found = [(content.get(key) or {}, label, note) for key, label, note in rows]
+    return [
+        charts.BandRow(
+            label=label,
+            note=note,
+            value=item["value"],
+            low=item["low"],
+            high=item["high"],
+            margin=tuple(item["margin"]),
+        )
+        for item, label, note in found
+        if item.get("value") is not None
+    ]
+
+
+def _ratios(content: Values) -> list[Values]:
+    """Return achieved over predicted, geometric mean over the networks, for the three predictions."""
+    names = {"limited": "achieved / P0, limited", "total": "achieved / P1, total", "used": "achieved / P2, as measured"}
+    ratios = content.get("achieved_over_predicted", {})
+    rows = [{"name": names[key], "value": f"{ratios[key]:.3f}"} for key in names if ratios.get(key) is not None]
+    if content.get("coverage95") is not None:
+        rows.append({"name": "points inside 95 % ellipsoids", "value": f"{100 * content['coverage95']:.1f} %"})
+    if content.get("kendall") is not None:
+        rows.append({"name": "rank correlation (Kendall)", "value": f"{content['kendall']:.2f}"})
+    return rows
+
+
+def _histograms(content: Values) -> list[Markup]:
+    names = {"t": "T", "s0_squared": "s0²", "f": "F", "rho": "ρ"}
+    p_values = content.get("uniformity_p", {})
+    pits = content.get("pit", {})
+    return [
+        charts.histogram_chart(pits[key], f"{label}   p = {p_values.get(key, float('nan')):.2g}", _bins(len(pits[key])))
+        for key, label in names.items()
+        if pits.get(key)
+    ]
+
+
+def _bins(count: int) -> int:
+    """Return so many bins that about four values are expected in each, from four to ten."""
+    return min(max(count // 4, 4), 10)
+
+
+def _trend(content: Values) -> str:
+    slope = content.get("slope") or {}
+    if slope.get("value") is None:
+        return ""
+    return f" Slope in logarithms {slope['value']:.2f}, 90 % interval {slope['low']:.2f} to {slope['high']:.2f} "
+    "(1 is expected; a narrow front leaves it wide)."

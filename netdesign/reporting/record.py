@@ -94,8 +94,9 @@ class NetworkRecord:
 
     @property
     def verdict(self) -> str:
-        """The verdict of the validation, or "not validated"."""
-        return "not validated" if self.validation is None else str(self.validation.get("verdict", "no verdict"))
+        """The worst verdict of its validations, or "not validated"."""
+        found = [str(content["verdict"]) for content in (self.validation, *self.repeats) if content is not None]
+        return next((verdict for verdict in ("failed", "fail", "pass") if verdict in found), "not validated")
 
     @property
     def warnings(self) -> tuple[str, ...]:

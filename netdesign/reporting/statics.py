@@ -17,6 +17,7 @@ from PIL import Image
 from netdesign.model.arrays import Floats, Ints
 from netdesign.reporting import palette
 from netdesign.reporting.drawing import View, draw_ellipsoids, draw_part, draw_tags, frustum_lines
+from netdesign.reporting.proof import scatter
 from netdesign.reporting.record import NetworkRecord, RunRecord
 
 STYLE: Any = {
@@ -122,6 +123,34 @@ def network_figure(record: RunRecord, network: NetworkRecord, mesh: MESH) -> Fig
         factor = _ellipsoids(right, record, network, mesh)
         _title(left, f"Network {network.name}: {network.images} images, tour {network.tour:.4g} {record.tour_unit}")
         _title(right, f"1-sigma ellipsoids × {factor:,.0f}".replace(",", " ") + ", total propagation")
+    return figure
+
+
+def achieved_figure(record: RunRecord) -> Figure | None:
+    """Return achieved rms error against predicted rms sigma of every proved network; None when there is none."""
+    proved = [(network, found) for network in record.networks if (found := scatter(network)) is not None]
+    if not proved:
+        return None
+    predicted = np.array([found["predicted"] for _, found in proved])
+    achieved = np.array([found["achieved"] for _, found in proved])
+    passed = np.array([found["pass"] for _, found in proved])
+    colors = np.array(palette.ordered(network.images for network, _ in proved))
+    low, high = min(predicted.min(), achieved.min()) / 1.15, max(predicted.max(), achieved.max()) * 1.15
+    with rc_context(STYLE):
+        figure = Figure(figsize=(5.6, 5.0), layout="constrained")
+        axes = figure.add_subplot()
+        line = np.array([low, high])
+        axes.fill_between(line, 0.9 * line, 1.1 * line, color="#dfe7ec", linewidth=0, label="± 10 %")
+        axes.plot(line, line, color=palette.BOUND, linewidth=1.1, linestyle=(0, (4, 2)), label="equal")
+        axes.scatter(predicted[passed], achieved[passed], c=colors[passed], s=28, zorder=3)
+        axes.scatter(predicted[~passed], achieved[~passed], c=palette.BAD, s=36, marker="x", zorder=3,
+                     label="outside its own intervals")  # fmt: skip
+        if high / low > 4:
+            axes.set(xscale="log", yscale="log")
+        axes.set(xlim=(low, high), ylim=(low, high), xlabel="predicted rms sigma [µm]",
+                 ylabel="achieved rms error [µm]", title="Achieved against predicted (P2)")  # fmt: skip
+        axes.set_aspect("equal")
+        axes.legend(loc="upper left")
     return figure
 
 

@@ -20,8 +20,8 @@ GLOSSARY = (
     ),
     (
         "Limited and total propagation",
-        "Limited (or limiting) error propagation takes the poses of the cameras as error-free, which is quick to search "
-        "with; total propagation is the covariance of the full bundle adjustment with unknown poses.",
+        "Limited (or limiting) error propagation takes the poses of the cameras as error-free, quick to search with; "
+        "total propagation is the covariance of the full bundle adjustment with unknown poses.",
     ),
     (
         "Datum",

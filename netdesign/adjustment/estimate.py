@@ -8,6 +8,7 @@ what is not determined. GTSAM (``bundle``), Ceres and dense bordered normal equa
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from netdesign.adjustment.covariance import datum_covariance
 from netdesign.adjustment.diagnosis import calibration_complaints, depth_weakness, point_complaints, quality_warnings
@@ -120,8 +121,9 @@ def appraise(
     measured = _measured(problem, layout)
     redundancy = measured - unknowns + open_
     sigma0 = float(np.sqrt(solution.cost / redundancy)) if redundancy > 0 else float("nan")
-    # With enough redundancy the residuals know the noise better than an assumption does.
-    weakness = depth_weakness(problem, layout, reduced) * (sigma0 if redundancy >= 20 else 1.0)
+    # With enough redundancy the residuals know the noise better than an assumption does: its upper 99.5 % bound.
+    noise = sigma0 / np.sqrt(chi2.ppf(0.005, redundancy) / redundancy) if redundancy >= 20 else 1.0
+    weakness = depth_weakness(problem, layout, reduced) * float(noise)
     complaints = point_complaints(problem, layout, reduced, weakness)
     if complaints:
         raise InfeasibleError("; ".join(complaints))

@@ -103,15 +103,15 @@ def test_a_renamed_tool_frame_of_a_user_urdf(tmp_path):
 def test_errors_are_one_clear_line(tmp_path):
     with pytest.raises(InputError, match=r"ur10.*found 'ur11'"):
         find_robot("ur11")
-    with pytest.raises(InputError, match="nothing.urdf"):
+    with pytest.raises(InputError, match=r"nothing\.urdf"):
         load_chain(_user_cell(tmp_path / "nothing.urdf", "tool0"))
     broken = tmp_path / "broken.urdf"
     broken.write_text("<robot")
-    with pytest.raises(InputError, match="broken.urdf"):
+    with pytest.raises(InputError, match=r"broken\.urdf"):
         load_chain(_user_cell(broken, "tool0"))
     lost = tmp_path / "lost.urdf"
     lost.write_text(find_robot("ur5")[0].read_text().replace("collision/base.stl", "collision/gone.stl"))
-    with pytest.raises(InputError, match="gone.stl"):
+    with pytest.raises(InputError, match=r"gone\.stl"):
         load_chain(_user_cell(lost, "tool0"))
     with pytest.raises(InputError, match=r"robot\.lock: expected one of shoulder_pan_joint"):
         load_chain(cell(lock={"shoulder": 0.0}))

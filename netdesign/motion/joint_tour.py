@@ -22,7 +22,7 @@ from numba import njit
 from netdesign.model.arrays import Floats
 from netdesign.motion.cell import ArmCell
 from netdesign.motion.joint_map import options_at
-from netdesign.motion.tour import _improve, _nearest_neighbour
+from netdesign.motion.tour import _improve
 
 _ROUNDS = 3
 _FAST = {"reassoc", "contract", "arcp", "nsz", "nnan", "ninf"}
@@ -146,43 +146,42 @@ def joint_tour(options, count, label, barred, law, timed, tour, rounds):  # type
     work = scratch(n, max(most, n))
     distances, pairs = np.zeros((n + 1, n + 1)), np.empty((n + 1, n + 2))
     picked = np.empty((1, r, n))
-    choice, other = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
+    choice = np.zeros(n, dtype=np.int64)
     trial = tour.copy()
-    best = choose_options(options, count, label, barred, tour, law, timed, choice, work)
-    for _ in range(rounds):
-        if n < 3:
-            break
-        _chosen_distances(options, label, barred, choice, law, timed, picked, work, distances)
-        for x in range(n + 1):
-            trial[x] = tour[x]
-        shorter = _improve(distances, trial, pairs)
-        if shorter > best * (1.0 - 1e-9):
-            break
-        best = choose_options(options, count, label, barred, trial, law, timed, other, work)
+    best = np.inf
+    for turn in range(rounds + 1):
+        best = choose_options(options, count, label, barred, trial, law, timed, choice, work)
         for x in range(n + 1):
             tour[x] = trial[x]
-        for i in range(n):
-            choice[i] = other[i]
+        if turn == rounds or n < 3:
+            break
+        _chosen_distances(options, label, barred, choice, law, timed, picked, work, distances)
+        if _improve(distances, trial, pairs) > best * (1.0 - 1e-9):
+            break
     return best, choice
 
 
 @njit(cache=True, error_model="numpy")
 def directions_tour(viewpoints):  # type: ignore[no-untyped-def]
-    """Return the closed tour (n + 1,), dummy in front, of viewpoints (n, 2): nearest neighbour and 3-opt of chords."""
+    """Return the closed tour (n + 1,), dummy in front, that goes from viewpoint (n, 2) to nearest viewpoint."""
     n = viewpoints.shape[0]
-    distances = np.zeros((n + 1, n + 1))
     unit = np.empty((n, 3))
+    tour = np.empty(n + 1, dtype=np.int64)
+    tour[0] = 0
     for i in range(n):
         flat = math.cos(viewpoints[i, 1])
         unit[i, 0], unit[i, 1] = flat * math.cos(viewpoints[i, 0]), flat * math.sin(viewpoints[i, 0])
         unit[i, 2] = math.sin(viewpoints[i, 1])
-        for j in range(i):
-            dx, dy, dz = unit[i, 0] - unit[j, 0], unit[i, 1] - unit[j, 1], unit[i, 2] - unit[j, 2]
-            distances[i + 1, j + 1] = distances[j + 1, i + 1] = math.sqrt(dx * dx + dy * dy + dz * dz)
-    if n < 2:
-        return np.arange(n + 1)
-    tour = _nearest_neighbour(distances, 1)
-    _improve(distances, tour, np.empty((n + 1, n + 2)))
+        tour[i + 1] = i + 1
+    for position in range(2, n + 1):
+        here = tour[position - 1] - 1
+        nearest, best = position, -2.0
+        for candidate in range(position, n + 1):
+            there = tour[candidate] - 1
+            cosine = unit[here, 0] * unit[there, 0] + unit[here, 1] * unit[there, 1] + unit[here, 2] * unit[there, 2]
+            if cosine > best:
+                nearest, best = candidate, cosine
+        tour[position], tour[nearest] = tour[nearest], tour[position]
     return tour
 
 

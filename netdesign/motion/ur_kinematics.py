@@ -70,27 +70,64 @@ def ur_arm(chain: Chain, tolerance: float = 1e-9) -> UrArm | None:
     return UrArm(axes=a, points=np.array(points[:4]), wrist=points[4] + along * a[4], flange_inverse=inverse(flange))
 
 
+# Vectors are tuples of three here: numba compiles them in a fraction of the time it takes for array expressions.
+
+
 @njit(cache=True, error_model="numpy")
-def _rotation(axis, angle):  # type: ignore[no-untyped-def]
+def _row(array, index):  # type: ignore[no-untyped-def]
+    return array[index, 0], array[index, 1], array[index, 2]
+
+
+@njit(cache=True, error_model="numpy")
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, error_model="numpy")
+def _cross(a, b):  # type: ignore[no-untyped-def]
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True, error_model="numpy")
+def _sum(a, scale, b):  # type: ignore[no-untyped-def]
+    """Return a + scale b."""
+    return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
+
+
+@njit(cache=True, error_model="numpy")
+def _turn(axis, angle, v):  # type: ignore[no-untyped-def]
+    """Return v turned about a unit axis (Rodrigues)."""
     c, s = math.cos(angle), math.sin(angle)
-    x, y, z = axis
-    t = 1.0 - c
-    return np.array(
-        [
-            [c + t * x * x, t * x * y - s * z, t * x * z + s * y],
-            [t * x * y + s * z, c + t * y * y, t * y * z - s * x],
-            [t * x * z - s * y, t * y * z + s * x, c + t * z * z],
-        ]
+    along = (1.0 - c) * _dot(axis, v)
+    w = _cross(axis, v)
+    return (
+        c * v[0] + s * w[0] + along * axis[0],
+        c * v[1] + s * w[1] + along * axis[1],
+        c * v[2] + s * w[2] + along * axis[2],
     )
 
 
 @njit(cache=True, error_model="numpy")
 def _angle_about(axis, start, end):  # type: ignore[no-untyped-def]
     """Return the angle about a unit axis that takes the part of ``start`` normal to it to that of ``end``."""
-    cross = np.cross(start, end)
-    return math.atan2(
-        axis[0] * cross[0] + axis[1] * cross[1] + axis[2] * cross[2],
-        np.dot(start, end) - np.dot(axis, start) * np.dot(axis, end),
+    return math.atan2(_dot(axis, _cross(start, end)), _dot(start, end) - _dot(axis, start) * _dot(axis, end))
+
+
+@njit(cache=True, error_model="numpy")
+def _rotated(g, v):  # type: ignore[no-untyped-def]
+    return (
+        g[0, 0] * v[0] + g[0, 1] * v[1] + g[0, 2] * v[2],
+        g[1, 0] * v[0] + g[1, 1] * v[1] + g[1, 2] * v[2],
+        g[2, 0] * v[0] + g[2, 1] * v[1] + g[2, 2] * v[2],
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _rotated_back(g, v):  # type: ignore[no-untyped-def]
+    return (
+        g[0, 0] * v[0] + g[1, 0] * v[1] + g[2, 0] * v[2],
+        g[0, 1] * v[0] + g[1, 1] * v[1] + g[2, 1] * v[2],
+        g[0, 2] * v[0] + g[1, 2] * v[1] + g[2, 2] * v[2],
     )
 
 
@@ -98,15 +135,12 @@ def _angle_about(axis, start, end):  # type: ignore[no-untyped-def]
 def _two_angles(a, b, c):  # type: ignore[no-untyped-def]
     """Return (middle, half) of the two solutions middle ± half of a cos x + b sin x = c; half < 0 when none.
 
-    A value past the edge by rounding counts as the edge: the caller closes the pose again.
+    A value past the edge by rounding counts as the edge.
     """
     length = math.hypot(a, b)
-    if length < 1e-12:
+    if length < 1e-12 or abs(c) > length * (1.0 + 1e-9):
         return 0.0, -1.0
-    ratio = c / length
-    if abs(ratio) > 1.0 + 1e-9:
-        return 0.0, -1.0
-    return math.atan2(b, a), math.acos(min(max(ratio, -1.0), 1.0))
+    return math.atan2(b, a), math.acos(min(max(c / length, -1.0), 1.0))
 
 
 @njit(cache=True, error_model="numpy")
@@ -115,55 +149,55 @@ def ur_branches(axes, points, wrist, flange_inverse, target, q, found):  # type:
 
     target: base_from_flange (4, 4). Limits are not looked at.
     """
-    found[:] = False
-    g = target @ flange_inverse
-    turn = np.ascontiguousarray(g[:3, :3])
-    shift = np.ascontiguousarray(g[:3, 3])
-    a1, h, a5, a6 = axes[0], axes[1], axes[4], axes[5]
+    g = np.empty((3, 4))
+    for a in range(3):
+        for b in range(4):
+            g[a, b] = target[a, 3] if b == 3 else 0.0
+            for k in range(3):
+                g[a, b] += target[a, k] * flange_inverse[k, b]
+    a1, h, a5, a6 = _row(axes, 0), _row(axes, 1), _row(axes, 4), _row(axes, 5)
+    p1, p2, p3, p4 = _row(points, 0), _row(points, 1), _row(points, 2), _row(points, 3)
+    w = (wrist[0], wrist[1], wrist[2])
     # Signs that make joints 3 and 4 turn about h itself.
-    sign3 = 1.0 if np.dot(axes[2], h) > 0.0 else -1.0
-    sign4 = 1.0 if np.dot(axes[3], h) > 0.0 else -1.0
-    moved = turn @ wrist + shift - points[0]
+    sign3 = 1.0 if _dot(_row(axes, 2), h) > 0.0 else -1.0
+    sign4 = 1.0 if _dot(_row(axes, 3), h) > 0.0 else -1.0
+    for label in range(BRANCHES):
+        found[label] = False
+    moved = _sum(_sum(_rotated(g, w), 1.0, (g[0, 3], g[1, 3], g[2, 3])), -1.0, p1)
     # h·(R(-q1) moved) = moved·(R(q1) h); R(q1) h = h cos + (a1 x h) sin since h is normal to a1.
-    side = np.cross(a1, h)
-    middle1, half1 = _two_angles(np.dot(moved, h), np.dot(moved, side), np.dot(wrist - points[0], h))
+    side = _cross(a1, h)
+    middle1, half1 = _two_angles(_dot(moved, h), _dot(moved, side), _dot(_sum(w, -1.0, p1), h))
     if half1 < 0.0:
         return
-    link2 = points[2] - points[1]
-    link3 = points[3] - points[2]
-    link2 = link2 - np.dot(link2, h) * h
-    link3 = link3 - np.dot(link3, h) * h
+    link2, link3 = _sum(p3, -1.0, p2), _sum(p4, -1.0, p3)
+    link2, link3 = _sum(link2, -_dot(link2, h), h), _sum(link3, -_dot(link3, h), h)
     rest = _angle_about(h, link2, link3)
-    long2, long3 = np.dot(link2, link2), np.dot(link3, link3)
+    long2, long3 = _dot(link2, link2), _dot(link3, link3)
+    sixth = _rotated(g, a6)
     for shoulder in range(2):
         q1 = middle1 + (half1 if shoulder == 0 else -half1)
-        r1 = _rotation(a1, q1)
-        back = r1.T @ turn
         # h·(R5 a6) = cos q5 h·a6 + sin q5 h·(a5 x a6), h normal to a5.
-        middle5, half5 = _two_angles(np.dot(h, a6), np.dot(h, np.cross(a5, a6)), np.dot(h, back @ a6))
+        middle5, half5 = _two_angles(_dot(h, a6), _dot(h, _cross(a5, a6)), _dot(h, _turn(a1, -q1, sixth)))
         if half5 < 0.0:
             continue
-        seen = back.T @ h
-        origin = r1.T @ (shift - points[0]) + points[0]
+        seen = _rotated_back(g, _turn(a1, q1, h))
+        wrist_now = _sum(_turn(a1, -q1, moved), 1.0, p1)
         for wrist_branch in range(2):
             q5 = middle5 + (half5 if wrist_branch == 0 else -half5)
-            r5 = _rotation(a5, q5)
-            q6 = -_angle_about(a6, r5.T @ h, seen)
-            r56 = r5 @ _rotation(a6, q6)
-            planar = back @ r56.T
-            # e2 e3 e4 maps x to planar x + moved_origin.
-            offset = origin + back @ wrist - planar @ wrist
-            reach = planar @ points[3] + offset - points[1]
-            reach = reach - np.dot(reach, h) * h
-            total = _angle_about(h, side, planar @ side)
-            cosine = (np.dot(reach, reach) - long2 - long3) / (2.0 * math.sqrt(long2 * long3))
+            q6 = -_angle_about(a6, _turn(a5, -q5, h), seen)
+            # The planar arm's rotation of v is R1^T R_G R6^T R5^T v; e2 e3 e4 takes w to wrist_now.
+            turned = _turn(a1, -q1, _rotated(g, _turn(a6, -q6, _turn(a5, -q5, side))))
+            arm = _turn(a1, -q1, _rotated(g, _turn(a6, -q6, _turn(a5, -q5, _sum(p4, -1.0, w)))))
+            reach = _sum(_sum(arm, 1.0, wrist_now), -1.0, p2)
+            reach = _sum(reach, -_dot(reach, h), h)
+            total = _angle_about(h, side, turned)
+            cosine = (_dot(reach, reach) - long2 - long3) / (2.0 * math.sqrt(long2 * long3))
             if abs(cosine) > 1.0 + 1e-9:
                 continue
             bend = math.acos(min(max(cosine, -1.0), 1.0))
             for elbow in range(2):
-                inner = bend if elbow == 0 else -bend
-                q3 = inner - rest
-                q2 = _angle_about(h, link2 + _rotation(h, q3) @ link3, reach)
+                q3 = (bend if elbow == 0 else -bend) - rest
+                q2 = _angle_about(h, _sum(link2, 1.0, _turn(h, q3, link3)), reach)
                 label = 4 * shoulder + 2 * wrist_branch + elbow
                 q[label, 0], q[label, 1], q[label, 2] = q1, q2, sign3 * q3
                 q[label, 3], q[label, 4], q[label, 5] = sign4 * (total - q2 - q3), q5, q6

@@ -160,8 +160,9 @@ def evaluate_networks(
                 cells[k] = cell_index(alpha, beta, tables.grid)
                 k += 1
         objectives[p, 0], objectives[p, 1], objectives[p, 2] = np.inf, np.inf, k
-        violation[p] = missing_sightings(cells[:k], tables, at_least)
-        if violation[p] > 0:
+        lacking = missing_sightings(cells[:k], tables, at_least)
+        if lacking > 0:
+            violation[p] = 1.0 + lacking  # always worse than a tour that is too long
             continue
         for s in range(len(moments)):
             moments[s] = 0.0
@@ -178,4 +179,4 @@ def evaluate_networks(
         weak = variances_from_moments(moments, tables.points, tables.radius, tables.point_count, variances)
         length, refused = motion_objective(viewpoints[:k], directions[:k], tables, joint)
         objectives[p, 0], objectives[p, 1] = precision_objective(variances, tables), length
-        violation[p] = weak + refused + max(0.0, length / tables.longest - 1.0)
+        violation[p] = weak + refused + max(0.0, 1.0 - tables.longest / length if length > 0.0 else 0.0)

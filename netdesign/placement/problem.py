@@ -15,8 +15,10 @@ from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
 from netdesign.motion.joint_tour import law_of
+from netdesign.photogrammetry.datum import inner_basis
 from netdesign.photogrammetry.limited_error import blocked
 from netdesign.photogrammetry.precision import sighting_sigma
+from netdesign.photogrammetry.total_trace import total_trace
 from netdesign.placement.coverage import coverage
 from netdesign.placement.encoding import Chromosomes
 from netdesign.placement.evaluation import (
@@ -43,6 +45,7 @@ class Problem:
         chromosomes: the encoding and its operators.  visibility: what is seen from where.
         joint_map: joints for every viewpoint, None when motion is measured in the workspace.
         tables, joint: what the kernels read.  cover: the smallest set cover found.
+        gauge: (3m, 7) of ``datum.inner_basis`` when the criterion is the total mean variance, else None.
         scale: (2, 3) ideal and reference point of the normalised objectives (log f1, f2, f3).
         threads: evaluation threads; they do not change any result.
     """
@@ -55,6 +58,7 @@ class Problem:
     joint: JointTables | None
     cover: Cover
     scale: Floats
+    gauge: Floats | None = None
     threads: int = field(default_factory=lambda: int(numba.get_num_threads()))
 
     @staticmethod
@@ -86,6 +90,7 @@ class Problem:
             joint=joint,
             cover=cover,
             scale=_scale(task, tables, joint, slots),
+            gauge=_gauge(task),
         )
         progress("set cover", 3, 3)
         return problem
@@ -105,7 +110,24 @@ class Problem:
         else:
             for start in starts:
                 part(start)
+        if self.gauge is not None:
+            self._propagate_totally(bits, genes, objectives, violation)
         return objectives, violation
+
+    def _propagate_totally(self, bits: Bools, genes: Floats, objectives: Floats, violation: Floats) -> None:
+        """Replace f1 of the feasible rows by total error propagation; what it cannot determine becomes infeasible."""
+        task = self.task
+        points, intrinsics = task.scene.targets.points, task.camera.intrinsics
+        for row in np.flatnonzero(violation <= 0).tolist():
+            viewpoints = genes[row][bits[row]]
+            poses = task.sphere.cameras(viewpoints)
+            visible = np.repeat(self.visibility.sure_tags(self.visibility.cell_of(viewpoints)), CORNERS_PER_TAG, axis=1)
+            sigma = np.array([[task.camera.sigma_px]])
+            if task.camera.corner_noise is not None:
+                sigma = sighting_sigma(task.camera, poses, task.scene.targets)
+            trace = total_trace(poses, points, intrinsics, visible, sigma, self.gauge)
+            objectives[row, 0] = trace / (3 * len(points))
+            violation[row] = 0.0 if np.isfinite(trace) else 0.5
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
@@ -166,6 +188,14 @@ class Problem:
         """Return objectives (P, 3) with 0 at the ideal and 1 at the reference: log f1, f2, f3."""
         values = np.stack([np.log(np.maximum(objectives[:, 0], 1e-300)), objectives[:, 1], objectives[:, 2]], axis=1)
         return np.asarray((values - self.scale[0]) / (self.scale[1] - self.scale[0]))
+
+
+def _gauge(task: Task) -> Floats | None:
+    """The points' datum defect when f1 is the total mean variance; the worst point is searched with the limited one."""
+    objectives = task.study.objectives
+    if objectives.propagation != "total" or objectives.precision != "mean_variance":
+        return None
+    return inner_basis(task.scene.targets.points)
 
 
 def _sphere_tables(task: Task, visibility: VisibilityMap) -> SphereTables:

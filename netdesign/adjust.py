@@ -22,6 +22,7 @@ from netdesign.files.store import plain, write_json
 from netdesign.model.adjustment import Adjustment, Datum
 from netdesign.model.arrays import Bools
 from netdesign.model.progress import Progress, silent
+from netdesign.photo_set import is_photo_set, read_photo_set
 from netdesign.photogrammetry.observation_equations import parameter_matrix
 
 
@@ -64,7 +65,7 @@ def adjust_folder(
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder with an observation set or an image set, found none")
     progress("adjust", 0, 3, "read")
-    found = _read(folder, sigma_px, progress)
+    found, left_out = _read(folder, sigma_px, progress)
     control_path, bars_path = control or folder / "control.csv", scale_bars or folder / "scalebars.csv"
     has_control, has_bars = control is not None or control_path.is_file(), scale_bars is not None or bars_path.is_file()
     chosen: Datum = datum or ("control" if has_control else "scale" if has_bars else "free")
@@ -90,7 +91,7 @@ def adjust_folder(
     )
     progress("adjust", 1, 3, "adjust")
     adjustment = estimate(problem, robust=robust, sigma_known=found.sigma_known)
-    adjustment = replace(adjustment, warnings=(*_notes(problem, found), *adjustment.warnings))
+    adjustment = replace(adjustment, warnings=(*left_out, *_notes(problem, found), *adjustment.warnings))
     progress("adjust", 2, 3, "write")
     record = adjustment_payload(adjustment, found.image_names, found.point_names)
     path = (out or folder) / "adjustment.json"
@@ -99,12 +100,16 @@ def adjust_folder(
     return AdjustOutcome(record=plain(record), text=_summary(adjustment, path), adjustment=adjustment, path=path)
 
 
-def _read(folder: Path, sigma_px: float | None, progress: Progress) -> ObservationSet:
-    """Return the observation set in the folder."""
+def _read(folder: Path, sigma_px: float | None, progress: Progress) -> tuple[ObservationSet, tuple[str, ...]]:
+    """Return what the folder holds, and what of it was left out."""
+    if is_photo_set(folder):
+        photos = read_photo_set(folder, sigma_px, progress)
+        return photos.observations, photos.notes
     if any((folder / name).is_file() for name in MODEL_FILES):
-        return read_observation_set(folder, sigma_px)
-    del progress
-    raise InputError(f"{folder}: expected a COLMAP text model ({', '.join(MODEL_FILES)}) or camera.toml with photos")
+        return read_observation_set(folder, sigma_px), ()
+    raise InputError(
+        f"{folder}: expected a COLMAP text model ({', '.join(MODEL_FILES)}) or camera.toml with photographs"
+    )
 
 
 def _mask(names: Sequence[str] | None, point_names: Sequence[str]) -> Bools | None:

@@ -87,8 +87,8 @@ def read_observation_set(folder: Path, sigma_px: float | None) -> ObservationSet
     )
 
 
-def _rows(path: Path, required: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
-    """Return (where, row) of a CSV file with at least the given columns.
+def csv_rows(path: Path, required: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
+    """Return ("file:line", row) of a CSV file with at least the given columns.
 
     Raises:
         InputError: no such file, not text, or a column is missing.
@@ -141,7 +141,7 @@ def _read_observations(
     with path.open(encoding="utf-8-sig") as file:
         head = [name.strip() for name in file.readline().split(",")]
     by_tag = "point" not in head and "tag" in head
-    rows = _rows(path, ["image", *(["tag", "corner"] if by_tag else ["point"]), "x_px", "y_px"])
+    rows = csv_rows(path, ["image", *(["tag", "corner"] if by_tag else ["point"]), "x_px", "y_px"])
     covariance_columns = ["sxx_px2", "sxy_px2", "syy_px2"]
     given = bool(rows) and all(name in rows[0][1] for name in covariance_columns)
     images = {name: index for index, name in enumerate(names)}
@@ -189,7 +189,7 @@ def read_control(path: Path, point_names: Sequence[str]) -> ControlPoints:
     table = {name: index for index, name in enumerate(point_names)}
     columns = ("point", "x_mm", "y_mm", "z_mm", "sigma_mm")
     index, xyz, sigma = [], [], []
-    for where, row in _rows(path, columns):
+    for where, row in csv_rows(path, columns):
         index.append(_index(where, "control point", row["point"], table))
         values = _numbers(where, row, columns[1:])
         if values[3] < 0:
@@ -210,7 +210,7 @@ def read_scale_bars(path: Path, point_names: Sequence[str]) -> ScaleBars:
     table = {name: index for index, name in enumerate(point_names)}
     columns = ("a", "b", "length_mm", "sigma_mm")
     ends, values = [], []
-    for where, row in _rows(path, columns):
+    for where, row in csv_rows(path, columns):
         pair = (_index(where, "scale bar end", row["a"], table), _index(where, "scale bar end", row["b"], table))
         length, sigma = _numbers(where, row, columns[2:])
         if pair[0] == pair[1]:

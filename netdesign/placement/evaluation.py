@@ -31,6 +31,7 @@ class SphereTables(NamedTuple):
         variance: m² per unit of the moment form, sigma² / f².
         min_rays, min_tags: images per tag, tags per image.
         criterion: MEAN_VARIANCE or MAX_SIGMA.  longest: admissible f2.
+        limits: (4,) lowest and highest azimuth, lowest and highest elevation, rad.
     """
 
     points: Floats
@@ -46,6 +47,7 @@ class SphereTables(NamedTuple):
     min_tags: int
     criterion: int
     longest: float
+    limits: Floats
 
 
 class JointTables(NamedTuple):
@@ -113,6 +115,24 @@ def write_weights(
         weights[start], weights[start + 1], weights[start + 2], weights[start + 3] = value, value, value, value
 
 
+@njit(cache=True, error_model="numpy")
+def write_moments(
+    viewpoints: Floats, directions: Floats, cells: Ints, tables: SphereTables, weights: Floats, four: Floats,
+    moments: Floats,
+) -> None:  # fmt: skip
+    """Write the moments of viewpoints (k, 2), whose directions and cells are known; ``weights``, ``four``: scratch."""
+    moments[:] = 0.0
+    k = len(viewpoints)
+    for first in range(0, k, 4):
+        for slot in range(4):
+            i = min(first + slot, k - 1)
+            sign = 1.0 if first + slot < k else 0.0
+            write_weights(viewpoints[i, 0], viewpoints[i, 1], cells[i], sign, slot, tables, weights)
+            for axis in range(3):
+                four[slot, axis] = directions[i, axis]
+        add_four_cameras(moments, tables.points, four, weights, tables.radius)
+
+
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
 def precision_objective(variances: Floats, tables: SphereTables) -> float:
     """Return f1 from the variances: their mean in m², or the square root of the largest in m."""
@@ -164,18 +184,7 @@ def evaluate_networks(
         if lacking > 0:
             violation[p] = 1.0 + lacking  # always worse than a tour that is too long
             continue
-        for s in range(len(moments)):
-            moments[s] = 0.0
-        for first in range(0, k, 4):
-            for slot in range(4):
-                i = first + slot
-                if i < k:
-                    write_weights(viewpoints[i, 0], viewpoints[i, 1], cells[i], 1.0, slot, tables, weights)
-                    for axis in range(3):
-                        four[slot, axis] = directions[i, axis]
-                else:
-                    write_weights(0.0, 0.0, cells[0], 0.0, slot, tables, weights)
-            add_four_cameras(moments, tables.points, four, weights, tables.radius)
+        write_moments(viewpoints[:k], directions, cells, tables, weights, four, moments)
         weak = variances_from_moments(moments, tables.points, tables.radius, tables.point_count, variances)
         length, refused = motion_objective(viewpoints[:k], directions[:k], tables, joint)
         objectives[p, 0], objectives[p, 1] = precision_objective(variances, tables), length

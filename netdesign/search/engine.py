@@ -24,7 +24,7 @@ from netdesign.search.state import State, generator_state, restored_generator
 Engine = Literal["memetic", "nsga2"]
 
 GENETIC_SHARE, GENETIC_MOST = 0.2, 60
-BATCH = 16  # members improved between two updates of the archive
+BATCH = 8  # members improved between two updates of the archive
 
 OnStep = Callable[[State], None]
 

@@ -1,0 +1,213 @@
+"""Local search around networks, compiled: cameras nudged, moved, taken away or added, computed by differences.
+
+From a member of the archive, under one weighting of log f1 against log f2, single-camera moves are tried one after the
+other and kept when the weighted sum falls. f1 comes from the moments minus the old camera plus the new one; in the
+workspace f2 comes from taking the station out of the tour and putting it back where it costs least, repaired by 3-opt
+only when that brings the move within reach. Every network tried is written out, for the archive to judge.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from netdesign.model.arrays import Floats, Ints
+from netdesign.motion.tour import _improve
+from netdesign.photogrammetry.limited_error import LANES, add_four_cameras, variances_from_moments
+from netdesign.placement.evaluation import (
+    SphereTables,
+    missing_sightings,
+    motion_objective,
+    precision_objective,
+    write_direction,
+    write_moments,
+    write_weights,
+)
+from netdesign.placement.visibility_map import cell_index
+
+PROMISING = 0.05  # of the weighted logarithms: a move this near to an improvement gets its tour repaired
+MOVE, REMOVE, ADD = 0, 1, 2
+
+
+class Tries(NamedTuple):
+    """What is tried on each of B members, drawn outside: C candidates each.
+
+    Attributes:
+        kind: (B, C) MOVE, REMOVE or ADD.
+        camera: (B, C) which camera moves or goes.
+        viewpoint: (B, C, 2) where it goes, rad; NaN for a step from where it is.
+        step: (B, C, 2) bearing from east to north and length of the step, rad.
+        preference: (B,) weight of log f1 in [0, 1], the rest is log f2's.
+    """
+
+    kind: Ints
+    camera: Ints
+    viewpoint: Floats
+    step: Floats
+    preference: Floats
+
+
+@njit(cache=True, error_model="numpy")
+def write_step(viewpoint: Floats, direction: Floats, step: Floats, limits: Floats, moved: Floats) -> None:
+    """Write the viewpoint (2,) after a step (bearing, length) along the sphere, folded into ``limits`` (4,)."""
+    east_x, east_y = -np.sin(viewpoint[0]), np.cos(viewpoint[0])
+    sine, up = np.sin(step[1]), np.cos(step[1])
+    east, north = np.cos(step[0]) * sine, np.sin(step[0]) * sine
+    x = up * direction[0] + east * east_x - north * direction[2] * east_y
+    y = up * direction[1] + east * east_y + north * direction[2] * east_x
+    z = up * direction[2] + north * (direction[0] * east_y - direction[1] * east_x)
+    middle = 0.5 * (limits[0] + limits[1])
+    alpha = middle + (np.arctan2(y, x) - middle + np.pi) % (2.0 * np.pi) - np.pi
+    moved[0] = min(max(alpha, limits[0]), limits[1])
+    moved[1] = min(max(np.arctan2(z, np.sqrt(x * x + y * y)), limits[2]), limits[3])
+
+
+@njit(cache=True, error_model="numpy")
+def write_chords(directions: Floats, k: int, a: int, D: Floats) -> None:
+    """Write the chords from station ``a`` to the ``k`` stations with unit directions; station i is node i + 1."""
+    for b in range(k):
+        square = 0.0
+        for axis in range(3):
+            square += (directions[a, axis] - directions[b, axis]) ** 2
+        D[a + 1, b + 1] = D[b + 1, a + 1] = np.sqrt(square)
+
+
+@njit(cache=True, error_model="numpy")
+def reinserted(D: Floats, t: Ints, count: int, gone: int, new: int, moved: Floats, out: Ints) -> float:
+    """Write the closed tour t (count,) without node ``gone``, and with ``new`` where it costs least; return its length.
+
+    ``gone`` = -1 takes nothing out, ``new`` = -1 puts nothing in; ``moved`` (N,) distances of ``new`` to the nodes.
+    """
+    left = 0
+    for x in range(count):
+        if t[x] != gone:
+            out[left] = t[x]
+            left += 1
+    length, best, where = 0.0, np.inf, 0
+    for x in range(left):
+        a, b = out[x], out[x + 1 if x + 1 < left else 0]
+        length += D[a, b]
+        more = moved[a] + moved[b] - D[a, b]
+        if more < best:
+            best, where = more, x
+    if new < 0:
+        return length
+    for x in range(left, where + 1, -1):
+        out[x] = out[x - 1]
+    out[where + 1] = new
+    return length + best
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def improve_networks(
+    viewpoints: Floats, sizes: Ints, tries: Tries, tables: SphereTables, joint: Any,
+    found: Floats, counts: Ints, objectives: Floats, violation: Floats,
+) -> None:  # fmt: skip
+    """Try what ``tries`` says on B feasible networks, improving them on the way; write every network tried.
+
+    Args:
+        viewpoints: (B, n, 2), of which the first ``sizes`` (B,) are used; changed in place.
+        found: (B, C, n, 2), counts: (B, C), objectives: (B, C, 2), violation: (B, C): the networks tried.
+    """
+    members, slots = viewpoints.shape[0], viewpoints.shape[1]
+    blocks = len(tables.points) // (3 * LANES)
+    now, then = np.zeros((slots + 1, 3)), np.zeros((slots + 1, 3))  # directions
+    cells, new_cells = np.zeros(slots + 1, np.int64), np.zeros(slots + 1, np.int64)
+    four, weights = np.zeros((4, 3)), np.zeros(blocks * 4 * LANES)
+    moments, changed = np.zeros(blocks * 9 * LANES), np.zeros(blocks * 9 * LANES)
+    variances = np.zeros(blocks * 3 * LANES)
+    at_least = np.zeros((tables.min_rays, tables.sure.shape[1]), np.uint64)
+    D, trial_D = np.zeros((slots + 2, slots + 2)), np.zeros((slots + 2, slots + 2))
+    P = np.zeros((slots + 2, slots + 3))
+    t, trial = np.zeros(slots + 2, np.int64), np.zeros(slots + 2, np.int64)
+    for b in range(members):
+        here, k = viewpoints[b], sizes[b]
+        for i in range(k):
+            write_direction(here[i, 0], here[i, 1], now[i])
+            cells[i] = cell_index(here[i, 0], here[i, 1], tables.grid)
+        write_moments(here[:k], now, cells, tables, weights, four, moments)
+        weights[:] = 0.0  # slots 2 and 3 stay empty from here on
+        variances_from_moments(moments, tables.points, tables.radius, tables.point_count, variances)
+        f1 = precision_objective(variances, tables)
+        if joint is None:
+            for i in range(k):
+                write_chords(now, k, i, D)
+            for x in range(k + 1):
+                t[x] = x
+            f2 = tables.radius * _improve(D, t[: k + 1], P)
+        else:
+            f2 = motion_objective(here[:k], now[:k], tables, joint)[0]
+        w = tries.preference[b]
+        value = w * np.log(f1) + (1.0 - w) * np.log(f2 + 1e-9)
+        for c in range(tries.kind.shape[1]):
+            kind = tries.kind[b, c]
+            i = k if kind == ADD else tries.camera[b, c] % k
+            size = k + 1 if kind == ADD else (k - 1 if kind == REMOVE else k)
+            violation[b, c], counts[b, c] = np.inf, 0
+            if size > slots or size < 2:
+                continue
+            there = found[b, c]
+            for x in range(k):
+                there[x, 0], there[x, 1], new_cells[x] = here[x, 0], here[x, 1], cells[x]
+                then[x, 0], then[x, 1], then[x, 2] = now[x, 0], now[x, 1], now[x, 2]
+            if kind == REMOVE:  # the last station takes the place of the one that goes
+                there[i, 0], there[i, 1], new_cells[i] = here[k - 1, 0], here[k - 1, 1], cells[k - 1]
+                then[i, 0], then[i, 1], then[i, 2] = now[k - 1, 0], now[k - 1, 1], now[k - 1, 2]
+            else:
+                if np.isnan(tries.viewpoint[b, c, 0]):
+                    write_step(here[i % k], now[i % k], tries.step[b, c], tables.limits, there[i])
+                else:
+                    there[i, 0], there[i, 1] = tries.viewpoint[b, c, 0], tries.viewpoint[b, c, 1]
+                write_direction(there[i, 0], there[i, 1], then[i])
+                new_cells[i] = cell_index(there[i, 0], there[i, 1], tables.grid)
+            counts[b, c] = size
+            lacking = missing_sightings(new_cells[:size], tables, at_least)
+            if lacking > 0:
+                violation[b, c] = 1.0 + lacking
+                continue
+            j = i % k  # what an addition takes away weighs nothing, and so does what a removal adds
+            write_weights(there[j, 0], there[j, 1], new_cells[j], 0.0 if kind == REMOVE else 1.0, 0, tables, weights)
+            if kind == ADD:
+                write_weights(there[i, 0], there[i, 1], new_cells[i], 1.0, 0, tables, weights)
+            write_weights(here[j, 0], here[j, 1], cells[j], 0.0 if kind == ADD else -1.0, 1, tables, weights)
+            for axis in range(3):
+                four[0, axis], four[1, axis] = then[i if kind == ADD else j, axis], now[j, axis]
+            for s in range(len(moments)):
+                changed[s] = moments[s]
+            add_four_cameras(changed, tables.points, four, weights, tables.radius)
+            weak = variances_from_moments(changed, tables.points, tables.radius, tables.point_count, variances)
+            if weak > 0:
+                violation[b, c] = weak
+                continue
+            new_f1, refused = precision_objective(variances, tables), 0
+            if joint is None:
+                if kind == REMOVE:
+                    length = reinserted(D, t, k + 1, i + 1, -1, D[0], trial)
+                else:
+                    write_chords(then, size, i, trial_D)
+                    gone = i + 1 if kind == MOVE else -1
+                    length = reinserted(D, t, k + 1, gone, i + 1, trial_D[i + 1], trial)
+                new_f2 = tables.radius * length
+                near = w * np.log(new_f1) + (1.0 - w) * np.log(new_f2 + 1e-9) < value + PROMISING
+                if kind == MOVE and near:
+                    for x in range(1, k + 1):
+                        for y in range(1, k + 1):
+                            if x != i + 1 and y != i + 1:
+                                trial_D[x, y] = D[x, y]
+                    new_f2 = tables.radius * _improve(trial_D, trial[: k + 1], P)
+            else:
+                new_f2, refused = motion_objective(there[:size], then[:size], tables, joint)
+            objectives[b, c, 0], objectives[b, c, 1] = new_f1, new_f2
+            violation[b, c] = refused + max(0.0, 1.0 - tables.longest / new_f2 if new_f2 > 0.0 else 0.0)
+            new_value = w * np.log(new_f1) + (1.0 - w) * np.log(new_f2 + 1e-9)
+            if kind != MOVE or violation[b, c] > 0 or new_value >= value:
+                continue
+            value = new_value
+            here[i, 0], here[i, 1], cells[i] = there[i, 0], there[i, 1], new_cells[i]
+            now[i, 0], now[i, 1], now[i, 2] = then[i, 0], then[i, 1], then[i, 2]
+            for s in range(len(moments)):
+                moments[s] = changed[s]
+            if joint is None:
+                write_chords(now, k, i, D)
+                for x in range(k + 1):
+                    t[x] = trial[x]

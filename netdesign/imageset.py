@@ -82,7 +82,7 @@ def render_images(
     missing = [index for index, path in enumerate(paths) if not path.is_file()]
     session = pickle.dumps((scene, camera, shoot))
     jobs = [(session, index, world_from_cam[index], paths[index]) for index in missing]
-    for _ in _each(_render_one, jobs, executor, "render", progress):
+    for _ in each(_render_one, jobs, executor, "render", progress):
         pass
     return paths
 
@@ -100,7 +100,7 @@ def measure_images(
     if floor_px is None:
         floor_px = (camera.corner_noise or read_corner_noise(None)).floor_px
     jobs = [(path, camera, targets, gates, floor_px) for path in paths]
-    return list(_each(_measure_one, jobs, executor, "measure", progress))
+    return list(each(_measure_one, jobs, executor, "measure", progress))
 
 
 def observations_of(
@@ -223,10 +223,10 @@ def _measure_one(job: tuple[Path, Camera, Targets, Gates | None, float]) -> list
     return measure(read_picture(path), camera, targets.family, targets.size_m, ids, gates, floor_px)
 
 
-def _each(
+def each(
     work: Callable[[Any], Any], jobs: Sequence[Any], executor: Executor | None, stage: str, progress: Progress
 ) -> Iterator[Any]:
-    """Yield the results of ``work`` in the order of ``jobs``."""
+    """Yield the results of ``work`` in the order of ``jobs``, done here or by the executor's processes."""
     futures: list[Future[Any]] = [] if executor is None else [executor.submit(work, job) for job in jobs]
     for done, job in enumerate(jobs):
         yield work(job) if executor is None else futures[done].result()

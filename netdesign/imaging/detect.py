@@ -41,15 +41,37 @@ def detect(picture: NDArray[np.generic], family: str, ids: Collection[int] | Non
         InputError: the family is not known.
     """
     grey = np.ascontiguousarray(picture if picture.dtype == np.uint8 else np.asarray(picture, np.uint16) >> 8, np.uint8)
+    sighted: list[Sighted] = []
+    for item in _recognised(grey, family, ids):
+        _add(item, sighted)
+    if ids is None or len({item.tag_id for item in sighted}) < len(ids):
+        # Once more, enlarged: cells of about 2 px lose bits at the original size, and noise breaks other outlines.
+        large = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        for item in _recognised(np.asarray(large), family, ids):
+            # Pixel centres: the enlarged picture has its first sample at -0.25.
+            _add(Sighted(tag_id=item.tag_id, corners_px=item.corners_px / 2 - 0.25), sighted)
+    return sorted(sighted, key=lambda item: (item.tag_id, *item.corners_px.ravel().tolist()))
+
+
+def _recognised(grey: NDArray[np.generic], family: str, ids: Collection[int] | None) -> list[Sighted]:
     corners, found, _ = _detector(family, max(grey.shape)).detectMarkers(grey)
     if found is None:
         return []
-    sighted = [
+    return [
         Sighted(tag_id=int(tag), corners_px=np.asarray(quad, np.float64).reshape(4, 2))
         for tag, quad in zip(np.asarray(found).ravel(), corners, strict=True)
         if ids is None or int(tag) in ids
     ]
-    return sorted(sighted, key=lambda item: (item.tag_id, *item.corners_px.ravel().tolist()))
+
+
+def _add(item: Sighted, sighted: list[Sighted]) -> None:
+    """Add a sighting unless the same tag, same id and centres closer than half an edge, is there already."""
+    for known in sighted:
+        edge = float(np.linalg.norm(known.corners_px[1] - known.corners_px[0]))
+        apart = float(np.linalg.norm(item.corners_px.mean(axis=0) - known.corners_px.mean(axis=0)))
+        if item.tag_id == known.tag_id and apart < 0.5 * edge:
+            return
+    sighted.append(item)
 
 
 def _detector(family: str, longer_side: int) -> "cv2.aruco.ArucoDetector":

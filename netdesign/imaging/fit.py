@@ -24,6 +24,8 @@ from netdesign.model.arrays import Floats
 UNKNOWNS = 14  # 8 of geometry, black, white, surround, light slope x and y, sigma
 SQUARE = np.array([[0.0, 0], [CELLS, 0], [CELLS, CELLS], [0, CELLS]])
 START_SIGMA_PX = 0.9
+SURROUND_SIGMA = 0.3  # a priori, of the surround about white, in units of the contrast
+SLOPE_SIGMA = 0.3  # a priori, of the light's slope over half a tag
 CHOOSING = 4  # iterations that choose their pixels; later a pixel on the rim must not flicker in and out
 LARGE_TAG_PX = 110.0  # above it one sub-pixel per pixel is enough for any blur of SHARPEST_COARSE_PX or more
 SHARPEST_COARSE_PX = 0.65
@@ -34,7 +36,7 @@ class Fit:
     """The result of one fit.
 
     Attributes:
-        corners_px: (4, 2) measured pixels.  covariance_px2: (8, 8), order x0 y0 x1 y1 …
+        corners_px: (4, 2) measured pixels.  covariance_px2: (8, 8), order x0 y0 x1 y1 …; inf when not converged.
         chi2_per_dof: weighted residuals per degree of freedom; pixels: how many were used.
         black, white, surround: grey levels.  light_slope: (2,) relative change from the centre to the edge.
         sigma_px: blur.  converged: False when the corners still moved or the normal matrix was singular.
@@ -178,6 +180,7 @@ def fit_tag(
     per_pixel = 1 if edges.min() > LARGE_TAG_PX else 2
     patch = _Patch(picture, seed_px, intrinsics, rim * cell + 2.0, per_pixel, 1.2)
     dark, bright = np.quantile(patch.grey, [0.1, 0.9])
+    contrast = max(float(bright - dark), 1.0)
     levels, sigma = np.array([dark, bright, bright, 0.0, 0.0]), START_SIGMA_PX
     normal, right = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
     covariance, chi2, pixels, converged, iteration = np.full((14, 14), np.inf), np.inf, 0, False, 0
@@ -199,12 +202,11 @@ def fit_tag(
         full = np.triu(normal) + np.triu(normal, 1).T
         matrix, vector = to_corners.T @ full @ to_corners, to_corners.T @ right
         # The surround shows only in the blur's tail, the slopes not at all in a tiny tag: weak knowledge of both.
-        matrix[10, 10] += 1.0 / 60.0**2
-        vector[10] += (levels[1] - levels[2]) / 60.0**2
+        matrix[10, 10] += 1.0 / (SURROUND_SIGMA * contrast) ** 2
+        vector[10] += (levels[1] - levels[2]) / (SURROUND_SIGMA * contrast) ** 2
         for slope in (11, 12):
-            matrix[slope, slope] += 1.0 / 0.3**2
-            vector[slope] -= levels[slope - 8] / 0.3**2
-        matrix[13, 13] += 1.0 / 1.0**2
+            matrix[slope, slope] += 1.0 / SLOPE_SIGMA**2
+            vector[slope] -= levels[slope - 8] / SLOPE_SIGMA**2
         free = np.arange(UNKNOWNS) if iteration > 2 else np.arange(11)  # first the coarse shape
         try:
             covariance = np.linalg.inv(matrix[np.ix_(free, free)])
@@ -213,7 +215,7 @@ def fit_tag(
         step = np.zeros(UNKNOWNS)
         step[free] = covariance @ vector[free]
         moved = float(np.abs(step[:8]).max())
-        if not np.isfinite(moved) or np.abs(corners - middle).max() > 6 * half:
+        if not np.isfinite(covariance).all() or not np.isfinite(moved) or np.abs(corners - middle).max() > 6 * half:
             break
         corners = corners + step[:8].reshape(4, 2) * min(1.0, 0.5 * cell / max(moved, 1e-12))
         levels += step[8:13]
@@ -232,7 +234,8 @@ def fit_tag(
     for index in range(4):
         spread[2 * index : 2 * index + 2, 2 * index : 2 * index + 2] = derivative[index]
     return Fit(
-        corners_px=measured, covariance_px2=spread @ covariance[:8, :8] @ spread.T,
+        corners_px=measured,
+        covariance_px2=spread @ covariance[:8, :8] @ spread.T if converged else np.full((8, 8), np.inf),
         chi2_per_dof=chi2 / max(pixels - UNKNOWNS, 1), pixels=pixels, black=float(levels[0]), white=float(levels[1]),
         surround=float(levels[2]), light_slope=levels[3:].copy(), sigma_px=sigma,
         converged=converged, iterations=iteration,

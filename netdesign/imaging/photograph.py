@@ -60,8 +60,14 @@ class Photographer:
         Raises:
             EnvironmentProblem: the renderer's system libraries are missing.
         """
+        return self.expose(self.light(world_from_cam), self.camera, self.shoot, index)
+
+    def light(self, world_from_cam: Floats) -> Picture:
+        """Return the (h, w) light on the sensor from a pose (4, 4), shading included."""
         light = self._renderer.render(world_from_cam)
-        if self._shading is not None:
-            light = light * self._shading
-        generator = noise_generator(self.shoot.seed, index) if self.shoot.noise else None
-        return expose(light, self.camera, generator, self.shoot.bits)
+        return light if self._shading is None else light * self._shading
+
+    @staticmethod
+    def expose(light: Picture, camera: Camera, shoot: Shoot, index: int) -> NDArray[np.generic]:
+        """Return the grey levels of picture ``index``: light (h, w) with the sensor's noise."""
+        return expose(light, camera, noise_generator(shoot.seed, index) if shoot.noise else None, shoot.bits)

@@ -3,7 +3,7 @@
 What is done here and why (measured in the project's imaging notes): flat shading, because anything else applies a
 gamma curve and shifts every edge once pixels are averaged; supersampling without multisampling, because texture
 filtering is what smooths a tag and multisampling only costs; vertices in the camera frame with the camera at the
-identity; textures of about 1.5 supersamples per texel with trilinear mip maps; horizontal bands, so that memory stays
+identity; textures of about one supersample per texel with trilinear mip maps; horizontal bands, so that memory stays
 bounded at any resolution. One OpenGL context per process, used from the thread that made it, never across a fork:
 start worker processes with "spawn".
 
@@ -31,7 +31,8 @@ from netdesign.model.scene import Scene
 PACKAGES = "libegl1 libgl1"  # Debian and Ubuntu; they pull Mesa's software rasteriser
 MAX_SIDE = 16384  # of a render target
 BAND_SAMPLES = 2**25  # supersamples of one band: 270 MB of colour and depth
-SUPERSAMPLES_PER_TEXEL = 1.5
+# An edge between texels is a ramp one texel wide; at one supersample its aliasing vanishes, at 1.5 it is 0.2.
+SUPERSAMPLES_PER_TEXEL = 1.0
 
 
 def probe() -> str:

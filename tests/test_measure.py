@@ -1,0 +1,87 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from netdesign.imaging.detect import detect
+from netdesign.imaging.measure import Gates, measure
+from netdesign.imaging.optics import expose, noise_generator
+from netdesign.imaging.reference import ReferenceRenderer
+from netdesign.model.frames import look_at, sphere_directions
+from netdesign.photogrammetry.collinearity import project
+from tests.scenes import CAMERA, plate_scene
+
+CAM = replace(
+    CAMERA, width_px=500, height_px=420, focal_px=np.array([1000.0, 1000.0]),
+    principal_point_px=np.array([249.5, 209.5]),
+)  # fmt: skip
+SCENE = plate_scene(side=3, spacing=0.04, tag_size=0.02)
+POSE = look_at(0.45 * sphere_directions(np.radians([20.0, 65.0])), np.zeros(3), 0.4)
+TRUTH = project(POSE, SCENE.targets.points, CAM.intrinsics)[0].reshape(-1, 4, 2)
+
+
+@pytest.fixture(scope="module")
+def picture():
+    return expose(ReferenceRenderer(SCENE, CAM).render(POSE), CAM, noise_generator(1, 0))
+
+
+def test_every_tag_is_found_and_good(picture):
+    found = measure(picture, CAM, "tag36h11", 0.02)
+    assert [tag.tag_id for tag in found] == list(range(9))
+    assert {tag.rejected for tag in found} == {""}
+    errors = np.array([tag.corners_px for tag in found]) - TRUTH
+    assert np.sqrt((errors**2).mean()) < 0.015
+    np.testing.assert_allclose([np.degrees(tag.incidence) for tag in found], 25.0, atol=6)
+
+
+def test_only_the_asked_ids_are_returned(picture):
+    assert [tag.tag_id for tag in detect(picture, "tag36h11", {2, 5, 400})] == [2, 5]
+
+
+def test_floor_is_added_to_every_variance(picture):
+    plain, raised = (measure(picture, CAM, "tag36h11", 0.02, {4}, floor_px=floor)[0] for floor in (0.0, 0.01))
+    np.testing.assert_allclose(raised.covariance_px2 - plain.covariance_px2, 1e-4 * np.eye(8), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("gates", "reason"),
+    [
+        (Gates(max_incidence=np.radians(10)), "incidence"),
+        (Gates(min_cell_px=20), "cell"),
+        (Gates(min_contrast=0.95), "contrast"),
+        (Gates(chi2_base=0.1, chi2_sigmas=0), "chi2"),
+        (Gates(max_seed_shift_cells=0, min_seed_shift_px=0), "seed"),
+        (Gates(border_px=200), "frame"),
+    ],
+)
+def test_every_gate_gives_its_reason(picture, gates, reason):
+    (tag,) = measure(picture, CAM, "tag36h11", 0.02, {4}, gates)
+    assert reason in tag.rejected
+
+
+def test_a_covered_tag_is_rejected_or_not_found(picture):
+    covered = picture.copy()
+    x, y = TRUTH[4].mean(axis=0).astype(int)
+    covered[y + 2 : y + 12, x : x + 12] = 235
+    for tag in measure(covered, CAM, "tag36h11", 0.02, {4}):
+        assert "chi2" in tag.rejected
+
+
+def test_a_tag_that_shows_twice_is_rejected_twice(picture):
+    double = np.concatenate([picture, picture], axis=1)
+    camera = replace(CAM, width_px=1000)
+    found = measure(double, camera, "tag36h11", 0.02, {4})
+    assert len(found) == 2
+    assert all(tag.rejected for tag in found)
+
+
+def test_sixteen_bit_pictures_are_measured_alike(picture):
+    light = ReferenceRenderer(SCENE, CAM).render(POSE)
+    deep = measure(expose(light, CAM, noise_generator(1, 0), 16), CAM, "tag36h11", 0.02)
+    flat = measure(picture, CAM, "tag36h11", 0.02)
+    np.testing.assert_allclose([tag.corners_px for tag in deep], [tag.corners_px for tag in flat], atol=0.01)
+    assert {tag.rejected for tag in deep} == {""}
+
+
+def test_an_empty_picture_has_no_tags():
+    assert measure(np.zeros((420, 500), np.uint8), CAM, "tag36h11", 0.02) == []

@@ -10,18 +10,21 @@ from netdesign.errors import InfeasibleError
 from netdesign.files.store import read_json, write_bytes, write_text
 from netdesign.files.study_text import study_toml
 from netdesign.model.task import Task
+from netdesign.motion.robot import load_chain
 from netdesign.photogrammetry.total_error import DATUM
 from netdesign.photogrammetry.visibility import Sight
 from netdesign.placement.distances import network_total_error
 from netdesign.reporting import statics
+from netdesign.reporting.arm import Arm
 from netdesign.reporting.mesh import feature_edges, light_mesh
 from netdesign.reporting.pages import Pictures, page
 from netdesign.reporting.record import NetworkRecord, RunRecord
-from netdesign.reporting.statics import Raster
+from netdesign.reporting.statics import Raster, thumbnail
 from netdesign.run_folder import open_run
 
 UM = 1e-6
 TRIANGLES = 20000  # of the part as it is drawn
+THUMBNAILS = 4
 SCREEN_WIDTH, PAPER_DPI = 1100, 170  # px, dots per inch
 
 
@@ -43,6 +46,10 @@ def write_report(run: Path) -> Path:
         picture = Raster.of(statics.network_figure(record, network, mesh), PAPER_DPI)
         write_bytes(run / "figures" / f"network-{network.name}.png", picture.png())
         networks[network.id] = picture.webp(SCREEN_WIDTH)
+    cell = statics.cell_figure(record, mesh)
+    arm = None if cell is None else Raster.of(cell, PAPER_DPI)
+    if arm is not None:
+        write_bytes(run / "figures" / "cell.png", arm.png())
     achieved = statics.achieved_figure(record)
     proof = None if achieved is None else Raster.of(achieved, PAPER_DPI)
     if proof is not None:
@@ -50,6 +57,7 @@ def write_report(run: Path) -> Path:
     pictures = Pictures(
         front=front.webp(SCREEN_WIDTH),
         networks=networks,
+        cell=None if arm is None else arm.webp(SCREEN_WIDTH),
         achieved=None if proof is None else proof.webp(SCREEN_WIDTH * 2 // 3),
     )
     path = run / "report.html"
@@ -74,6 +82,7 @@ def read_run(run: Path) -> RunRecord:
         campaign=_optional(run / "validation.json", "validation"),
         knee=network,
         reason=reason,
+        arm=None if task.cell is None else Arm.of(task.cell, load_chain(task.cell)),
         recomputed=max(_difference(network) for network in networks),
     )
 
@@ -96,8 +105,16 @@ def _network(run: Path, task: Task, sight: Sight, entry: dict[str, Any]) -> Netw
         repeats=tuple(
             read_json(path, "network-validation") for path in sorted(folder.glob("repeat-*/validation.json"))
         ),
+        thumbnails=_thumbnails(folder),
         adjustment=_optional(folder / "adjustment.json", "adjustment"),
     )
+
+
+def _thumbnails(folder: Path) -> tuple[tuple[str, bytes], ...]:
+    """Return a few images of a network, spread over its tour, as small JPEGs; none before it is rendered."""
+    paths = sorted((folder / "images").glob("*.png"))
+    chosen = sorted({round(index) for index in np.linspace(0, len(paths) - 1, min(len(paths), THUMBNAILS))})
+    return tuple((f"station {index + 1}", thumbnail(paths[index])) for index in chosen)
 
 
 def _recommended(run: Path) -> tuple[int, str]:

@@ -2,6 +2,9 @@
 
 import json
 import re
+import shutil
+import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -11,8 +14,11 @@ from matplotlib.figure import Figure
 from netdesign.errors import InputError
 from netdesign.files.store import read_json, write_json
 from netdesign.model.scene import Part
+from netdesign.motion.kinematics import forward
+from netdesign.motion.robot import load_chain
 from netdesign.report import read_run, write_report
-from netdesign.reporting import charts, drawing, mesh, palette, payload
+from netdesign.reporting import arm, charts, drawing, mesh, palette, payload, words
+from tests import cells
 from tests.runs import fail, pool_run, prove, ring_run
 from tests.scenes import CAMERA, box_part, ring
 
@@ -31,7 +37,7 @@ def designed(tmp_path_factory):
 def proved(tmp_path_factory):
     """A run with one network proved, one with more noise than predicted, one that could not be adjusted."""
     run = tmp_path_factory.mktemp("proved")
-    task = ring_run(run, sizes=(8, 10))
+    task = ring_run(run, sizes=(8,))
     prove(run, task, networks=[0])
     prove(run, task, networks=[1], noise=1.5)
     fail(run, task, 2, FAILURE)
@@ -200,6 +206,48 @@ def test_frusta_pass_through_the_image_corners():
     assert np.allclose(lines[:, :4, 0], poses[:, None, :3, 3])
     axis = poses[:, :3, 2]
     assert np.allclose(np.einsum("nci,ni->nc", lines[:, :4, 1] - poses[:, None, :3, 3], axis), 0.1)
+
+
+def test_the_drawn_arm_stands_where_the_kinematics_say():
+    cell = cells.cell()
+    chain = load_chain(cell)
+    drawn = arm.Arm.of(cell, chain)
+    joints = np.random.default_rng(2).uniform(-2, 2, (4, len(chain)))
+    for row, base_from_flange in zip(joints, forward(chain.placements, chain.last_from_flange, joints), strict=True):
+        world_from_cam = cell.world_from_base @ base_from_flange @ cell.flange_from_cam
+        assert np.allclose(drawn.world_from_links(row)[-1] @ drawn.last_from_cam, world_from_cam, atol=1e-12)
+    assert sum(len(faces) for _, faces in drawn.posed(joints[0])) > 1000
+
+
+def test_a_gridded_box_is_closed_and_faces_outwards():
+    vertices, faces = arm.box_mesh(np.array([1.0, 2.0, 3.0]), np.array([0.2, 0.3, 0.5]), steps=3)
+    corners = vertices[faces] - [1.0, 2.0, 3.0]
+    assert np.isclose(np.linalg.det(corners).sum() / 6, 0.03)
+    assert np.isclose(0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
+                                           axis=1).sum(), 2 * (0.06 + 0.15 + 0.1))  # fmt: skip
+
+
+def test_a_design_that_assumed_another_noise_is_flagged(proved):
+    network = read_run(proved[0]).networks[0]
+    assert words.design_gap(network) == []
+    told = {**network.validation, "predicted_rms_um": {"used": network.total_rms_um / 10}}
+    (text,) = words.design_gap(replace(network, validation=told))
+    assert "not that of the detector" in text
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+def test_a_browser_draws_every_figure_without_an_error(proved, tmp_path):
+    command = [
+        "chromium", "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+        "--disable-background-networking", "--disable-component-update", "--disable-sync",
+        f"--user-data-dir={tmp_path}", "--enable-unsafe-swiftshader", "--use-angle=swiftshader",
+        "--virtual-time-budget=20000", "--enable-logging=stderr", "--dump-dom",
+        f"file://{proved[0] / 'report.html'}",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=180, check=True)
+    assert "Uncaught" not in done.stderr
+    assert len(re.findall(r'class="plot[^"]*js-plotly-plot', done.stdout)) == 7
 
 
 def test_interval_rows_say_inside_or_outside():

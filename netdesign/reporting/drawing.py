@@ -4,6 +4,7 @@ A parallel projection maps an ellipsoid of covariance C exactly to the ellipse o
 painter's order needs no depth buffer for what is drawn here.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,21 @@ class View:
     def nearness(self, points: Floats) -> Floats:
         """Return (…,) the distance towards the eye."""
         return np.asarray(points @ self.axes[2])
+
+
+def draw_solids(axes: Axes, view: View, solids: Sequence[tuple[Floats, Ints, tuple[float, float, float]]]) -> None:
+    """Draw several meshes (vertices, faces, colour) that may hide one another: all triangles in painter's order."""
+    triangles = np.concatenate([vertices[faces] for vertices, faces, _ in solids])
+    colors = np.concatenate([np.tile(color, (len(faces), 1)) for _, faces, color in solids])
+    normals = np.concatenate([face_normals(vertices, faces) for vertices, faces, _ in solids])
+    front = normals @ view.axes[2] > 1e-6
+    order = np.argsort(view.nearness(triangles.mean(axis=1))[front], kind="stable")
+    light = view.axes.T @ np.array([-0.35, 0.55, 0.76])
+    shade = 0.72 + 0.28 * np.clip(normals[front][order] @ light, 0, 1)
+    shaded = np.clip(colors[front][order] * shade[:, None], 0, 1)
+    axes.add_collection(
+        PolyCollection(list(view.flat(triangles[front][order])), facecolors=shaded, edgecolors=shaded, linewidths=0.3)
+    )
 
 
 def draw_part(axes: Axes, view: View, vertices: Floats, faces: Ints, edges: Ints) -> None:

@@ -22,10 +22,11 @@ Values = dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class Pictures:
-    """Static figures as WebP: the front, every network by id, and achieved against predicted if there is one."""
+    """Static figures as WebP: the front, every network by id, the robot cell and achieved against predicted if any."""
 
     front: bytes
     networks: dict[int, bytes]
+    cell: bytes | None
     achieved: bytes | None
 
 
@@ -65,6 +66,7 @@ def page(record: RunRecord, mesh: MESH, pictures: Pictures, study_text: str) -> 
             "front": _uri("webp", pictures.front),
             "achieved": _uri("webp", pictures.achieved) if pictures.achieved else "",
         },
+        cell={"uri": _uri("webp", pictures.cell) if pictures.cell else "", "caption": _cell_caption(record)},
         columns=_columns(record),
         rows=_rows(record),
         networks=[_article(record, network, pictures.networks[network.id]) for network in record.networks],
@@ -80,6 +82,10 @@ def page(record: RunRecord, mesh: MESH, pictures: Pictures, study_text: str) -> 
 
 def _uri(kind: str, content: bytes) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _cell_caption(record: RunRecord) -> str:
+    return f"The cell: the robot at the first station of the recommended network {record.knee:04d}, and its tour."
 
 
 def _tiles(record: RunRecord) -> list[Values]:

@@ -8,6 +8,7 @@ import numpy as np
 from netdesign.model.arrays import Floats
 from netdesign.model.task import Task
 from netdesign.reporting import palette
+from netdesign.reporting.arm import Arm
 from netdesign.reporting.proof import scatter
 from netdesign.reporting.record import NetworkRecord, RunRecord
 from netdesign.reporting.statics import MESH, exaggeration
@@ -35,7 +36,29 @@ def payload(record: RunRecord, mesh: MESH) -> dict[str, Any]:
         "pointIds": list(task.scene.targets.point_ids),
         "frustum": decimals((corners - camera.principal_point_px) / camera.focal_px, 4),
         "radius": significant(sphere.radius * MM, 6),
+        "arm": None if record.arm is None else _arm(record.arm),
         "networks": [_network(record, network, color) for network, color in zip(record.networks, colors, strict=True)],
+    }
+
+
+def _arm(arm: Arm) -> dict[str, Any]:
+    """Return the robot: rows of 3x4 matrices with mm, meshes per link, boxes."""
+
+    def matrices(poses: Floats) -> list[float]:
+        scaled = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)[:, :3].copy()
+        scaled[:, :, 3] *= MM
+        return decimals(scaled, 5)
+
+    return {
+        "name": arm.name,
+        "base": matrices(arm.world_from_base),
+        "placements": matrices(arm.placements),
+        "camera": matrices(arm.last_from_cam),
+        "links": [
+            {"link": mesh.link, "v": decimals(mesh.vertices * MM, 1), "f": mesh.faces.ravel().tolist()}
+            for mesh in arm.links
+        ],
+        "obstacles": [decimals(box * MM, 2) for box in arm.obstacles],
     }
 
 
@@ -74,6 +97,7 @@ def _network(record: RunRecord, network: NetworkRecord, color: str) -> dict[str,
         "rays": network.rays.tolist(),
         "limited": _blocks(network.limited),
         "total_cov": _blocks(network.total),
+        "joints": None if (joints := network.planned.get("joints_rad")) is None else decimals(np.array(joints), 5),
         "error": _errors(network),
         "proof": scatter(network),
     }
@@ -82,7 +106,7 @@ def _network(record: RunRecord, network: NetworkRecord, color: str) -> dict[str,
 def _raised(task: Task) -> Floats:
     """Return the tag corners lifted a little off the part, so that the two surfaces do not fight in the picture."""
     targets = task.scene.targets
-    return targets.points + 0.02 * targets.size_m * targets.point_normals
+    return targets.points + 0.06 * targets.size_m * targets.point_normals
 
 
 def _blocks(covariance: Floats) -> list[float | None]:

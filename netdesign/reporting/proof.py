@@ -180,5 +180,7 @@ def _trend(content: Values) -> str:
     slope = content.get("slope") or {}
     if slope.get("value") is None:
         return ""
-    return f" Slope in logarithms {slope['value']:.2f}, 90 % interval {slope['low']:.2f} to {slope['high']:.2f} "
-    "(1 is expected; a narrow front leaves it wide)."
+    return (
+        f" Slope in logarithms {slope['value']:.2f}, 90 % interval {slope['low']:.2f} to {slope['high']:.2f} "
+        "(1 is expected; a narrow front leaves it wide)."
+    )

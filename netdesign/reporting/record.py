@@ -8,6 +8,7 @@ import numpy as np
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
+from netdesign.reporting.arm import Arm
 
 UM = 1e-6
 
@@ -114,6 +115,7 @@ class RunRecord:
     Attributes:
         design: the content of design.json.  campaign: that of RUN/validation.json, or None.
         knee: id of the network recommended when nothing is asked.  reason: why, in words.
+        arm: the robot, when the study has one.
         recomputed: largest relative difference of f1 between design.json and the report's own computation.
     """
 
@@ -124,6 +126,7 @@ class RunRecord:
     knee: int
     reason: str
     recomputed: float
+    arm: Arm | None = None
 
     @property
     def precision_name(self) -> str:

@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,11 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image
 
+from netdesign.errors import InputError
 from netdesign.model.arrays import Floats, Ints
 from netdesign.reporting import palette
-from netdesign.reporting.drawing import View, draw_ellipsoids, draw_part, draw_tags, frustum_lines
+from netdesign.reporting.arm import box_mesh
+from netdesign.reporting.drawing import View, draw_ellipsoids, draw_part, draw_solids, draw_tags, frustum_lines
 from netdesign.reporting.proof import scatter
 from netdesign.reporting.record import NetworkRecord, RunRecord
 
@@ -28,6 +31,7 @@ STYLE: Any = {
     "figure.facecolor": "white", "savefig.facecolor": "white",
 }  # fmt: skip
 EYE = View(azimuth=np.radians(-52.0), elevation=np.radians(28.0))
+CELL_EYE = View(azimuth=np.radians(-62.0), elevation=np.radians(24.0))
 MESH = tuple[Floats, Ints, Ints]  # vertices, faces, feature edges
 
 
@@ -62,6 +66,22 @@ class Raster:
         buffer = io.BytesIO()
         image.save(buffer, kind, **options)
         return buffer.getvalue()
+
+
+def thumbnail(path: Path, width: int = 320) -> bytes:
+    """Return a photo as a small grey JPEG.
+
+    Raises:
+        InputError: the file is not an image.
+    """
+    buffer = io.BytesIO()
+    try:
+        with Image.open(path) as image:
+            size = width, round(image.height * width / image.width)
+            image.convert("L").resize(size, Image.Resampling.LANCZOS).save(buffer, "JPEG", quality=80)
+    except OSError as error:
+        raise InputError(f"{path}: expected an image, found {error}") from None
+    return buffer.getvalue()
 
 
 def front_figure(record: RunRecord) -> Figure:
@@ -151,6 +171,36 @@ def achieved_figure(record: RunRecord) -> Figure | None:
                  ylabel="achieved rms error [µm]", title="Achieved against predicted (P2)")  # fmt: skip
         axes.set_aspect("equal")
         axes.legend(loc="upper left")
+    return figure
+
+
+def cell_figure(record: RunRecord, mesh: MESH) -> Figure | None:
+    """Return the robot at the first station of the recommended network; None without a robot."""
+    network = next(network for network in record.networks if network.id == record.knee)
+    joints = network.planned.get("joints_rad")
+    if record.arm is None or joints is None:
+        return None
+    poses, arm = network.world_from_cam, record.arm
+    solids = [(*box_mesh(centre, size, steps=24), (0.78, 0.76, 0.72)) for centre, size in arm.obstacles]
+    solids += [(mesh[0], mesh[1], (0.93, 0.92, 0.89))]
+    solids += [(vertices, faces, (0.62, 0.70, 0.76)) for vertices, faces in arm.posed(np.array(joints[0]))]
+    with rc_context(STYLE):
+        figure = Figure(figsize=(9.6, 6.0))
+        axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
+        draw_solids(axes, CELL_EYE, solids)
+        targets = record.task.scene.targets
+        tag_colors = np.tile([0.17, 0.18, 0.2, 0.9], (len(targets.ids), 1))
+        draw_tags(axes, CELL_EYE, targets.points.reshape(-1, 4, 3), np.asarray(targets.normals), tag_colors)
+        frusta = frustum_lines(record.task.camera, poses, 0.12 * record.task.sphere.radius)
+        first = frustum_lines(record.task.camera, poses[:1], 0.8 * record.task.sphere.radius)
+        for lines, color, width in ((frusta, palette.PREDICTED_TOTAL, 0.7), (first, palette.ACHIEVED, 0.9)):
+            axes.add_collection(LineCollection(list(CELL_EYE.flat(lines.reshape(-1, 2, 3))), colors=color,
+                                               linewidths=width))  # fmt: skip
+        flat = CELL_EYE.flat(poses[:, :3, 3])
+        axes.plot(*flat.T, color=palette.TOUR, linewidth=1.2)
+        for number, (x, y) in enumerate(flat, start=1):
+            axes.annotate(str(number), (x, y), xytext=(4, 4), textcoords="offset points", fontsize=7.5)
+        _frame(axes)
     return figure
 
 

@@ -204,15 +204,24 @@ function showScene() {
     const plot = part("stations");
     Plotly.react(plot, traces, sceneLayout(plot.layout?.scene?.camera || eye), config);
     part("where").textContent = `station ${current + 1} of ${count}, sees ${network.seen[current].length} tags`;
-    part("step").value = current + 1;
   };
-  part("step").max = count;
-  part("step").oninput = event => { stopTour(); current = Number(event.target.value) - 1; draw(); };
+  const robot = data.arm && network.joints, fine = robot ? .05 : 1, cell = robot && robotCell(network, part("cell"));
+  part("cell-figure").hidden = !robot;
+  part("step").max = count; part("step").step = fine;
+  let position = 0;
+  const go = to => {
+    position = Math.min(to, count - 1);
+    const station = Math.round(position);
+    if (station !== current) { current = station; draw(); }
+    part("step").value = position + 1;
+    if (cell) cell(position);
+  };
+  part("step").oninput = event => { stopTour(); go(Number(event.target.value) - 1); };
   part("play").onclick = () => {
     if (part("play").dataset.running) return stopTour();
     part("play").dataset.running = "yes"; part("play").textContent = "❚❚ Tour";
-    if (current === count - 1) current = -1;
-    const timer = setInterval(() => { if (current >= count - 1) return stopTour(); current += 1; draw(); }, 700);
+    if (position >= count - 1) go(0);
+    const timer = setInterval(() => { if (position >= count - 1) return stopTour(); go(robot ? position + .1 : position + 1); }, robot ? 90 : 700);
     stopTour = () => { clearInterval(timer); delete part("play").dataset.running; part("play").textContent = "▶ Tour"; stopTour = () => {}; };
   };
 
@@ -235,7 +244,57 @@ function showScene() {
     for (const other of $$('[data-role="propagation"] button', scene)) other.setAttribute("aria-pressed", String(other === button));
     uncertainty();
   };
-  draw(); uncertainty();
+  draw(); uncertainty(); if (cell) cell(0);
+}
+
+/* ------------------------------------------------------------------ the robot: forward kinematics of a chain that turns about z */
+const times = (a, b) => { const out = new Array(12); for (let r = 0; r < 3; r++) for (let c = 0; c < 4; c++) out[4 * r + c] = a[4 * r] * b[c] + a[4 * r + 1] * b[4 + c] + a[4 * r + 2] * b[8 + c] + (c === 3 ? a[4 * r + 3] : 0); return out; };
+const turn = q => [Math.cos(q), -Math.sin(q), 0, 0, Math.sin(q), Math.cos(q), 0, 0, 0, 0, 1, 0];
+const carry = (m, x, y, z) => [m[0] * x + m[1] * y + m[2] * z + m[3], m[4] * x + m[5] * y + m[6] * z + m[7], m[8] * x + m[9] * y + m[10] * z + m[11]];
+function linkPoses(joints) {
+  const poses = [data.arm.base];
+  joints.forEach((q, index) => poses.push(times(times(poses[index], data.arm.placements.slice(12 * index, 12 * index + 12)), turn(q))));
+  return poses;
+}
+function armMesh(poses) {
+  const x = [], y = [], z = [];
+  for (const mesh of data.arm.links) for (let k = 0; k < mesh.v.length; k += 3) { const p = carry(poses[mesh.link], mesh.v[k], mesh.v[k + 1], mesh.v[k + 2]); x.push(p[0]); y.push(p[1]); z.push(p[2]); }
+  return { x, y, z };
+}
+function boxes() {
+  const x = [], y = [], z = [], i = [], j = [], k = [], quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]];
+  for (const box of data.arm.obstacles) {
+    const start = x.length;
+    for (const sx of [-.5, .5]) for (const sy of [-.5, .5]) for (const sz of [-.5, .5]) { x.push(box[0] + sx * box[3]); y.push(box[1] + sy * box[4]); z.push(box[2] + sz * box[5]); }
+    for (const [a, b, c, d] of quads) { i.push(start + a, start + a); j.push(start + b, start + c); k.push(start + c, start + d); }
+  }
+  return { x, y, z, i, j, k };
+}
+/* Returns a function that puts the arm between two stations of the network. */
+function robotCell(network, plot) {
+  const count = data.arm.placements.length / 12, i = [], j = [], k = [];
+  let start = 0;
+  for (const mesh of data.arm.links) { for (let t = 0; t < mesh.f.length; t += 3) { i.push(start + mesh.f[t]); j.push(start + mesh.f[t + 1]); k.push(start + mesh.f[t + 2]); } start += mesh.v.length / 3; }
+  const joint = station => network.joints.slice(count * station, count * (station + 1));
+  const at = position => {
+    const from = Math.floor(position), to = Math.min(from + 1, network.images - 1), share = position - from, a = joint(from), b = joint(to);
+    const poses = linkPoses(a.map((value, axis) => value + share * (b[axis] - value))), camera = times(poses[count], data.arm.camera);
+    const seen = { x: [], y: [], z: [] }, put = p => { seen.x.push(p ? p[0] : null); seen.y.push(p ? p[1] : null); seen.z.push(p ? p[2] : null); }, depth = .9 * data.radius;
+    const apex = carry(camera, 0, 0, 0), base = [0, 1, 2, 3].map(corner => carry(camera, data.frustum[2 * corner] * depth, data.frustum[2 * corner + 1] * depth, depth));
+    for (let corner = 0; corner < 4; corner++) { put(apex); put(base[corner]); put(base[(corner + 1) % 4]); put(null); }
+    return [armMesh(poses), seen];
+  };
+  const line = { x: column(network.centres, 0), y: column(network.centres, 1), z: column(network.centres, 2) };
+  const [mesh, view] = at(0), dull = { ambient: .62, diffuse: .6, specular: .06, roughness: .8 };
+  const traces = [
+    { type: "mesh3d", ...mesh, i, j, k, color: css("--arm"), hoverinfo: "skip", lighting: dull },
+    { type: "scatter3d", mode: "lines", ...view, line: { color: css("--achieved"), width: 2 }, hoverinfo: "skip" },
+    ...partTraces(), tagMesh(Array(data.points.length / 6).fill(css("--part-edge"))),
+    { type: "mesh3d", ...boxes(), color: css("--part"), flatshading: true, hoverinfo: "skip", lighting: dull },
+    { type: "scatter3d", mode: "lines+markers", ...line, line: { color: css("--accent"), width: 3 }, marker: { size: 3, color: css("--accent") }, text: line.x.map((_, station) => `station ${station + 1}`), hovertemplate: "%{text}<extra></extra>" },
+  ];
+  Plotly.react(plot, traces, sceneLayout(plot.layout?.scene?.camera || { eye: { x: .62, y: -1.12, z: .4 }, center: { x: 0, y: 0, z: .04 } }), config);
+  return position => { const [body, seen] = at(position); Plotly.restyle(plot, { x: [body.x, seen.x], y: [body.y, seen.y], z: [body.z, seen.z] }, [0, 1]); };
 }
 
 /* ------------------------------------------------------------------ ellipsoids: an icosahedron carried by the square root of the covariance */

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from netdesign.adjustment.campaign import Band, Campaign, Member
+from netdesign.adjustment.lengths import LengthTest
 from netdesign.model.adjustment import Adjustment, Interval, Validation
 from netdesign.photogrammetry.collinearity import INTRINSIC_NAMES
 from netdesign.photogrammetry.reliability import external_reliability, minimal_detectable_error
@@ -226,4 +227,29 @@ def band_payload(band: Band) -> dict[str, Any]:
         "high": band.high,
         "margin": list(band.margin),
         "equivalent": band.equivalent,
+    }
+
+
+def length_payload(test: LengthTest, point_names: Sequence[str]) -> dict[str, Any]:
+    """Return the length measurement errors of an acceptance protocol; for ``details`` of a validation."""
+    return {
+        "length_test": {
+            "guideline": "in the manner of VDI/VDE 2634 part 1: seven lines, five lengths each",
+            "scale": "carried to the truth" if test.scale_free else "as estimated",
+            "longest_share_of_diagonal": test.longest_share,
+            "inside_u95": test.inside,
+            "acceptance_low": test.low,
+            "rms_error_over_sigma": test.rms_ratio,
+            "lengths": [
+                {
+                    "line": int(test.line[q]),
+                    "a": point_names[test.a[q]],
+                    "b": point_names[test.b[q]],
+                    "length_mm": test.length[q] * MM,
+                    "error_um": test.error[q] * 1e6,
+                    "u95_um": test.u95[q] * 1e6,
+                }
+                for q in range(len(test.line))
+            ],
+        }
     }

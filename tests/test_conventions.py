@@ -53,7 +53,7 @@ def test_projections_agree_between_opencv_gtsam_colmap_and_ours():
 
 @pytest.mark.parametrize("renderer", [Renderer(SCENE, LENS, 2), ReferenceRenderer(SCENE, LENS)])
 def test_rendered_and_detected_tags_lie_where_they_are_projected(renderer):
-    picture = expose(renderer.render(POSE), LENS, None)
+    picture = expose(renderer.render(inverse(POSE)), LENS, None)
     found = detect(picture, "tag36h11", range(9))
     assert [tag.tag_id for tag in found] == list(range(9))
     centres = CORNERS_PX.mean(axis=1)

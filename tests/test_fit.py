@@ -12,7 +12,7 @@ from netdesign.imaging.pattern import blur, cover, kernel_reach, kernels
 from netdesign.imaging.reference import ReferenceRenderer
 from netdesign.imaging.tags import cells
 from netdesign.model.camera import CornerNoise
-from netdesign.model.frames import look_at, sphere_directions
+from netdesign.model.frames import inverse, look_at, sphere_directions
 from netdesign.photogrammetry.collinearity import project
 from netdesign.photogrammetry.precision import corner_sigma
 from tests.scenes import CAMERA, plate_scene
@@ -29,7 +29,7 @@ GAIN, FLOOR = 255 / 1500, (255 * 8 / 1500) ** 2 + 1 / 12
 
 @pytest.fixture(scope="module")
 def light():
-    return ReferenceRenderer(SCENE, CAM).render(POSE)
+    return ReferenceRenderer(SCENE, CAM).render(inverse(POSE))
 
 
 def test_homography_maps_the_square_and_its_derivative_is_right():

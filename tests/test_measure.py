@@ -7,7 +7,7 @@ from netdesign.imaging.detect import detect
 from netdesign.imaging.measure import Gates, measure
 from netdesign.imaging.optics import expose, noise_generator
 from netdesign.imaging.reference import ReferenceRenderer
-from netdesign.model.frames import look_at, sphere_directions
+from netdesign.model.frames import inverse, look_at, sphere_directions
 from netdesign.photogrammetry.collinearity import project
 from tests.scenes import CAMERA, plate_scene
 
@@ -22,7 +22,7 @@ TRUTH = project(POSE, SCENE.targets.points, CAM.intrinsics)[0].reshape(-1, 4, 2)
 
 @pytest.fixture(scope="module")
 def picture():
-    return expose(ReferenceRenderer(SCENE, CAM).render(POSE), CAM, noise_generator(1, 0))
+    return expose(ReferenceRenderer(SCENE, CAM).render(inverse(POSE)), CAM, noise_generator(1, 0))
 
 
 def test_every_tag_is_found_and_good(picture):
@@ -76,7 +76,7 @@ def test_a_tag_that_shows_twice_is_rejected_twice(picture):
 
 
 def test_sixteen_bit_pictures_are_measured_alike(picture):
-    light = ReferenceRenderer(SCENE, CAM).render(POSE)
+    light = ReferenceRenderer(SCENE, CAM).render(inverse(POSE))
     deep = measure(expose(light, CAM, noise_generator(1, 0), 16), CAM, "tag36h11", 0.02)
     flat = measure(picture, CAM, "tag36h11", 0.02)
     np.testing.assert_allclose([tag.corners_px for tag in deep], [tag.corners_px for tag in flat], atol=0.01)

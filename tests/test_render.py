@@ -12,7 +12,7 @@ from netdesign.imaging.optics import expose
 from netdesign.imaging.reference import ReferenceRenderer
 from netdesign.imaging.render import Renderer, probe
 from netdesign.imaging.tags import cells, texture
-from netdesign.model.frames import look_at, sphere_directions
+from netdesign.model.frames import inverse, look_at, sphere_directions
 from netdesign.model.scene import Scene
 from netdesign.photogrammetry.collinearity import distort, project
 from tests.scenes import CAMERA, box_part, box_scene, plate_scene
@@ -34,8 +34,8 @@ def clean_errors(renderer, scene, camera, views, steepest_deg):
     """Return corner errors (k, 4, 2) px of pictures without noise, tags up to the given incidence."""
     errors = []
     for pose in views:
-        picture = expose(renderer.render(pose), camera, None, 16)
-        for quad in tag_quads(scene.targets, camera, pose):
+        picture = expose(renderer.render(inverse(pose)), camera, None, 16)
+        for quad in tag_quads(scene.targets, camera, inverse(pose)):
             truth = project(pose, scene.targets.points.reshape(-1, 4, 3)[quad.tag], camera.intrinsics)[0]
             inside = (truth > 12).all() and (truth < (camera.width_px - 12, camera.height_px - 12)).all()
             if inside and quad.incidence_cos > np.cos(np.radians(steepest_deg)):
@@ -65,7 +65,8 @@ def test_the_reference_renderer_is_exact(camera):
 def test_both_renderers_make_the_same_picture():
     scene = box_scene()
     difference = 255 * np.abs(
-        Renderer(scene, WIDE, 4).render(poses(1, 0.5)[0]) - ReferenceRenderer(scene, WIDE).render(poses(1, 0.5)[0])
+        Renderer(scene, WIDE, 4).render(inverse(poses(1, 0.5)[0]))
+        - ReferenceRenderer(scene, WIDE).render(inverse(poses(1, 0.5)[0]))
     )
     assert np.median(difference) < 0.5
     assert np.quantile(difference, 0.99) < 4  # silhouettes and far corners
@@ -79,7 +80,7 @@ def test_the_part_hides_what_is_behind_it():
     covered = Scene(part=replace(plate.part, vertices=vertices, faces=faces), targets=plate.targets)
     pose = look_at(np.array([0.02, 0.01, 0.4]), np.zeros(3), 0.3)
     for renderer in (Renderer(covered, SMALL, 2), ReferenceRenderer(covered, SMALL)):
-        picture = renderer.render(pose)
+        picture = renderer.render(inverse(pose))
         assert picture[200:400, 300:500].std() < 0.02  # only the lid
 
 
@@ -87,11 +88,11 @@ def test_the_picture_does_not_depend_on_what_was_drawn_before_or_on_bands(monkey
     scene = box_scene()
     renderer = Renderer(scene, WIDE, 2)
     pose, other = poses(2, 0.5)
-    first = renderer.render(pose)
-    renderer.render(other)
-    np.testing.assert_array_equal(renderer.render(pose), first)
+    first = renderer.render(inverse(pose))
+    renderer.render(inverse(other))
+    np.testing.assert_array_equal(renderer.render(inverse(pose)), first)
     monkeypatch.setattr("netdesign.imaging.render.BAND_SAMPLES", 800 * 4 * 150)
-    np.testing.assert_allclose(renderer.render(pose), first, atol=2 / 255)
+    np.testing.assert_allclose(renderer.render(inverse(pose)), first, atol=2 / 255)
 
 
 def test_probe_names_the_renderer():

@@ -70,13 +70,27 @@ def distorted_vertices(in_camera: Floats, distortion: Floats) -> Floats:
     return np.concatenate([np.stack([bent_x, bent_y], axis=-1) * depth, depth], axis=-1)
 
 
-def tag_quads(targets: Targets, camera: Camera, world_from_cam: Floats) -> list[TagQuad]:
+def through_the_lens(world_from_cam: Floats, offset_m: Floats, focus_m: float) -> Floats:
+    """Return the (4, 4) map from the world to what one point of the lens sees, as a camera frame.
+
+    A ray through the point (dx, dy) of the lens meets the ray through its centre at the focus distance F:
+    X' = X + dx (Z/F - 1), and Y likewise. Averaging pictures over the lens gives the depth of field.
+
+    Args:
+        offset_m: (2,) of the lens point in camera axes.
+    """
+    shear = np.eye(4)
+    shear[:2, 2] = offset_m / focus_m
+    shear[:2, 3] = -offset_m
+    return shear @ inverse(world_from_cam)
+
+
+def tag_quads(targets: Targets, camera: Camera, cam_from_world: Floats) -> list[TagQuad]:
     """Return the tags that face the camera and may show in the frame.
 
     Args:
-        world_from_cam: (4, 4) m.
+        cam_from_world: (4, 4) m, a rigid transform or one from ``through_the_lens``.
     """
-    cam_from_world = inverse(world_from_cam)
     centres = transform(cam_from_world, targets.centres)
     right = targets.x_axes @ cam_from_world[:3, :3].T
     up = np.cross(targets.normals, targets.x_axes) @ cam_from_world[:3, :3].T
@@ -139,12 +153,12 @@ def divided(part: Part, longest: float) -> tuple[Floats, Ints]:
     return np.concatenate(done), np.concatenate(done_face)
 
 
-def part_triangles(triangles: Floats, camera: Camera, world_from_cam: Floats, nearest: float) -> tuple[Floats, Bools]:
+def part_triangles(triangles: Floats, camera: Camera, cam_from_world: Floats, nearest: float) -> tuple[Floats, Bools]:
     """Return (k, 3, 3) triangles (m, world) in the camera frame, recessed and distorted, and the (k,) usable ones.
 
     A triangle with a vertex nearer than ``nearest`` along the optical axis is not usable.
     """
-    in_camera = transform(inverse(world_from_cam), triangles)
+    in_camera = transform(cam_from_world, triangles)
     usable: Bools = np.all(in_camera[..., 2] > nearest, axis=1)
     bent = np.zeros_like(in_camera)
     bent[usable] = distorted_vertices(in_camera[usable], camera.distortion) * (1 + RECESS)

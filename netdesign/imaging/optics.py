@@ -128,3 +128,15 @@ def expose(light: Picture, camera: Camera, generator: np.random.Generator | None
     rounded = np.clip(np.rint(level * np.float32(full_scale)), 0, full_scale)
     grey: NDArray[np.generic] = rounded.astype(np.uint8 if bits == 8 else np.uint16)
     return grey
+
+
+def glare(camera: Camera, count: int, random: np.random.Generator) -> Picture:
+    """Return the (h, w) stray light of ``count`` soft spots, up to twice full scale, anywhere in the frame."""
+    light = np.zeros((camera.height_px, camera.width_px), np.float32)
+    x = np.arange(camera.width_px, dtype=np.float32)[None, :]
+    y = np.arange(camera.height_px, dtype=np.float32)[:, None]
+    for _ in range(count):
+        centre_x, centre_y = random.uniform(0, camera.width_px), random.uniform(0, camera.height_px)
+        radius, peak = camera.width_px * random.uniform(0.01, 0.03), random.uniform(0.5, 2.0)
+        light += np.float32(peak) * np.exp(-((x - centre_x) ** 2 + (y - centre_y) ** 2) / np.float32(2 * radius**2))
+    return light

@@ -17,7 +17,7 @@ from netdesign.imaging.optics import Picture, decimate
 from netdesign.imaging.tags import CELLS, QUIET_CELLS, cells
 from netdesign.model.arrays import Floats
 from netdesign.model.camera import Camera
-from netdesign.model.frames import inverse, transform
+from netdesign.model.frames import transform
 from netdesign.model.scene import Scene
 
 SUBPIXELS = 2  # along a pixel; coverage is exact, they only carry the blur
@@ -101,30 +101,30 @@ class ReferenceRenderer:
         self.appearance = appearance or Appearance()
         self._level = face_levels(scene.part, self.appearance)
 
-    def render(self, world_from_cam: Floats) -> Picture:
-        """Return the (h, w) light on the sensor, full scale 1, for a pose (4, 4) m."""
+    def render(self, cam_from_world: Floats) -> Picture:
+        """Return the (h, w) light on the sensor, full scale 1; arguments as for ``render.Renderer.render``."""
         camera = self.camera
         shape = (camera.height_px * SUBPIXELS, camera.width_px * SUBPIXELS)
         light = np.full(shape, self.appearance.background, np.float32)
         inverse_depth = np.zeros(shape, np.float32)
-        self._draw_part(world_from_cam, light, inverse_depth)
-        for quad in tag_quads(self.scene.targets, camera, world_from_cam):
-            self._draw_tag(quad.tag, world_from_cam, light, inverse_depth)
+        self._draw_part(cam_from_world, light, inverse_depth)
+        for quad in tag_quads(self.scene.targets, camera, cam_from_world):
+            self._draw_tag(quad.tag, cam_from_world, light, inverse_depth)
         return decimate(light, camera.blur_px, SUBPIXELS, 0, camera.height_px)
 
-    def _draw_part(self, world_from_cam: Floats, light: Picture, inverse_depth: Picture) -> None:
+    def _draw_part(self, cam_from_world: Floats, light: Picture, inverse_depth: Picture) -> None:
         part, camera = self.scene.part, self.camera
         triangles, face = part.triangles, np.arange(len(part.faces))
         if camera.distortion.any():
-            distance = np.linalg.norm(part.vertices - world_from_cam[:3, 3], axis=1).min()
+            distance = np.linalg.norm(transform(cam_from_world, part.vertices), axis=1).min()
             triangles, face = divided(part, FACE_STEP_PX * max(float(distance), 0.05) / float(camera.focal_px.max()))
-        bent, usable = part_triangles(triangles, camera, world_from_cam, nearest=1e-3)
+        bent, usable = part_triangles(triangles, camera, cam_from_world, nearest=1e-3)
         xyz = np.concatenate([self._subpixels(bent[usable]) - 0.5, 1 / bent[usable][..., 2:]], axis=-1)
         _draw_triangles(xyz, self._level[face[usable]], light, inverse_depth)
 
-    def _draw_tag(self, tag: int, world_from_cam: Floats, light: Picture, inverse_depth: Picture) -> None:
+    def _draw_tag(self, tag: int, cam_from_world: Floats, light: Picture, inverse_depth: Picture) -> None:
         targets, look = self.scene.targets, self.appearance
-        outer = self._outline(tag, -QUIET_CELLS, -QUIET_CELLS, CELLS + 2 * QUIET_CELLS, world_from_cam)
+        outer = self._outline(tag, -QUIET_CELLS, -QUIET_CELLS, CELLS + 2 * QUIET_CELLS, cam_from_world)
         low = np.maximum(np.floor(outer[:, :2].min(axis=0)).astype(int) - 1, 0)
         high = np.minimum(np.ceil(outer[:, :2].max(axis=0)).astype(int) + 2, light.shape[::-1])
         if (high - low < 3).any():
@@ -132,9 +132,9 @@ class ReferenceRenderer:
         size = (high - low)[::-1]
         whole, dark = np.zeros(size), np.zeros(size)
         _add_outline(whole, outer[:, :2] - low, 1.0)
-        _add_outline(dark, self._outline(tag, 0, 0, CELLS, world_from_cam)[:, :2] - low, 1.0)
+        _add_outline(dark, self._outline(tag, 0, 0, CELLS, cam_from_world)[:, :2] - low, 1.0)
         for row, column in np.argwhere(cells(targets.family, int(targets.ids[tag])) == 1):
-            _add_outline(dark, self._outline(tag, column, row, 1, world_from_cam)[:, :2] - low, -1.0)
+            _add_outline(dark, self._outline(tag, column, row, 1, cam_from_world)[:, :2] - low, -1.0)
         # The orientation of the outlines in the picture decides the sign of all areas alike.
         whole, dark = np.abs(np.cumsum(whole, axis=1)), np.abs(np.cumsum(dark, axis=1))
         window = (slice(low[1], high[1]), slice(low[0], high[0]))
@@ -147,10 +147,10 @@ class ReferenceRenderer:
             whole, dark = np.where(hidden, 0.0, whole), np.where(hidden, 0.0, dark)
         light[window] = light[window] * (1 - whole) + look.white * (whole - dark) + look.black * dark
 
-    def _outline(self, tag: int, u: float, v: float, width: float, world_from_cam: Floats) -> Floats:
+    def _outline(self, tag: int, u: float, v: float, width: float, cam_from_world: Floats) -> Floats:
         """Return (k, 3) sub-pixel x, y and 1/depth along the square of ``width`` cells at cell coordinates (u, v)."""
         targets, camera = self.scene.targets, self.camera
-        distance = float(np.linalg.norm(targets.centres[tag] - world_from_cam[:3, 3]))
+        distance = float(np.linalg.norm(transform(cam_from_world, targets.centres[tag])))
         length_px = width * targets.size_m / CELLS * float(camera.focal_px.max()) / distance
         steps = int(np.ceil(length_px / EDGE_STEP_PX)) if camera.distortion.any() else 1
         along = np.arange(max(steps, 1)) / max(steps, 1) * width
@@ -162,10 +162,31 @@ class ReferenceRenderer:
         points = targets.centres[tag] + step * (
             (across[:, None] - CELLS / 2) * targets.x_axes[tag] - (down[:, None] - CELLS / 2) * up
         )
-        bent = distorted_vertices(transform(inverse(world_from_cam), points), camera.distortion)
+        bent = distorted_vertices(transform(cam_from_world, points), camera.distortion)
         return np.concatenate([self._subpixels(bent), 1 / bent[:, 2:]], axis=1)
 
     def _subpixels(self, in_camera: Floats) -> Floats:
         """Return (…, 2) sub-pixel coordinates, origin at the picture's top-left corner."""
         xy_px = in_camera[..., :2] / in_camera[..., 2:] * self.camera.focal_px + self.camera.principal_point_px
         return np.asarray((xy_px + 0.5) * SUBPIXELS)
+
+    def depth_and_tags(self, cam_from_world: Floats) -> tuple[NDArray[np.float32], NDArray[np.uint16]]:
+        """Return what each pixel's centre shows: depth (h, w) in m along the optical axis, 0 for nothing, and the tag.
+
+        The tag mask (h, w) holds id + 1 over a tag and its quiet zone, 0 elsewhere.
+        """
+        camera, targets = self.camera, self.scene.targets
+        inverse_depth = np.zeros((camera.height_px, camera.width_px), np.float32)
+        tags = np.zeros((camera.height_px, camera.width_px), np.float32)
+        bent, usable = part_triangles(self.scene.part.triangles, camera, cam_from_world, nearest=1e-3)
+        shapes = [(bent[usable], 0.0)] + [
+            (quad.vertices[quad.faces], float(targets.ids[quad.tag] + 1))
+            for quad in tag_quads(targets, camera, cam_from_world)
+        ]
+        for triangles, mark in shapes:
+            xy_px = triangles[..., :2] / triangles[..., 2:] * camera.focal_px + camera.principal_point_px
+            xyz = np.concatenate([xy_px, 1 / triangles[..., 2:]], axis=-1)
+            _draw_triangles(xyz, np.full(len(xyz), mark), tags, inverse_depth)
+        seen = inverse_depth > 0
+        depth = np.divide(1.0, inverse_depth, out=np.zeros_like(inverse_depth), where=seen)
+        return depth, tags.astype(np.uint16)

@@ -26,6 +26,7 @@ from netdesign.imaging.optics import Picture, decimate, margin_px
 from netdesign.imaging.tags import texture
 from netdesign.model.arrays import Floats, Ints
 from netdesign.model.camera import Camera
+from netdesign.model.frames import transform
 from netdesign.model.scene import Scene
 
 PACKAGES = "libegl1 libgl1"  # Debian and Ubuntu; they pull Mesa's software rasteriser
@@ -56,11 +57,11 @@ class Renderer:
         self._divided: dict[float, tuple[Floats, Ints]] = {}
         self._face_level = face_levels(scene.part, self.appearance)
 
-    def render(self, world_from_cam: Floats) -> Picture:
+    def render(self, cam_from_world: Floats) -> Picture:
         """Return the (h, w) light on the sensor, full scale 1, blurred by the optics and integrated over pixels.
 
         Args:
-            world_from_cam: (4, 4) m.
+            cam_from_world: (4, 4) m; rigid, or one of ``geometry.through_the_lens``.
 
         Raises:
             EnvironmentProblem: EGL or OpenGL is missing.
@@ -70,17 +71,17 @@ class Renderer:
         rows = max(1, min(BAND_SAMPLES // (factor**2 * camera.width_px), MAX_SIDE // factor) - 2 * margin)
         rows = min(rows, camera.height_px)
         picture = np.empty((camera.height_px, camera.width_px), np.float32)
-        with _Drawing(self._primitives(world_from_cam), self.appearance.background) as drawing:
+        with _Drawing(self._primitives(cam_from_world), self.appearance.background) as drawing:
             for first in range(0, camera.height_px, rows):
                 wanted = min(rows, camera.height_px - first)
                 fine = drawing.band(camera, factor, first - margin, rows + 2 * margin)
                 picture[first : first + wanted] = decimate(fine, camera.blur_px, factor, margin, wanted)
         return picture
 
-    def _primitives(self, world_from_cam: Floats) -> list[Any]:
+    def _primitives(self, cam_from_world: Floats) -> list[Any]:
         """Return the tags and the part as pyrender primitives in OpenGL's camera frame."""
         primitive, material = _pyrender().Primitive, _pyrender().MetallicRoughnessMaterial
-        quads = tag_quads(self.scene.targets, self.camera, world_from_cam)
+        quads = tag_quads(self.scene.targets, self.camera, cam_from_world)
         drawn = [
             primitive(
                 positions=_gl(quad.vertices), texcoord_0=np.asarray(quad.uv, np.float32), indices=quad.faces,
@@ -88,8 +89,8 @@ class Renderer:
             )
             for quad in quads
         ]  # fmt: skip
-        triangles, face = self._part_faces(world_from_cam)
-        bent, usable = part_triangles(triangles, self.camera, world_from_cam, nearest=1e-3)
+        triangles, face = self._part_faces(cam_from_world)
+        bent, usable = part_triangles(triangles, self.camera, cam_from_world, nearest=1e-3)
         if usable.any():
             level = np.repeat(self._face_level[face[usable]], 3)
             color = np.stack([level, level, level, np.ones_like(level)], axis=1).astype(np.float32)
@@ -101,12 +102,12 @@ class Renderer:
             )  # fmt: skip
         return drawn
 
-    def _part_faces(self, world_from_cam: Floats) -> tuple[Floats, Ints]:
+    def _part_faces(self, cam_from_world: Floats) -> tuple[Floats, Ints]:
         """Return the part's triangles, divided as finely as this view needs under distortion."""
         part = self.scene.part
         if not self.camera.distortion.any():
             return part.triangles, np.arange(len(part.faces))
-        distance = np.linalg.norm(part.vertices - world_from_cam[:3, 3], axis=1).min()
+        distance = np.linalg.norm(transform(cam_from_world, part.vertices), axis=1).min()
         longest = FACE_STEP_PX * max(float(distance), 0.05) / float(self.camera.focal_px.max())
         longest = float(2 ** np.floor(np.log2(longest)))  # few distinct values: divide once, use for many views
         if longest not in self._divided:

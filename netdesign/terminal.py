@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 SECONDS_BETWEEN_LINES = 5.0
+QUIET_SECONDS = 2.0  # a command that ends sooner needs no progress: bad input is one line and nothing else
 
 
 class TerminalProgress:
@@ -21,7 +22,7 @@ class TerminalProgress:
         self._console = Console(stderr=True)
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
-        self._last_line = 0.0
+        self._begin = self._last_line = time.monotonic()
         self._last_stage = ""
 
     def __enter__(self) -> "TerminalProgress":
@@ -47,6 +48,8 @@ class TerminalProgress:
             self._bars.update(self._tasks[stage], completed=done, total=total, note=note)
             return
         now = time.monotonic()
+        if now - self._begin < QUIET_SECONDS:
+            return
         if stage != self._last_stage or done >= total or now - self._last_line >= SECONDS_BETWEEN_LINES:
             self._last_stage, self._last_line = stage, now
             sys.stderr.write(f"{stage} {done}/{total}{'  ' + note if note else ''}\n")

@@ -1,0 +1,137 @@
+"""The verb design: recomputed without netdesign, byte-identical whatever the threads, clear refusals."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.recompute import Recomputed, nearest_neighbour_3opt, path_length
+
+DATASETS = Path(__file__).parents[1] / "datasets"
+
+STUDY = f"""format = 1
+name = "small"
+[part]
+mesh = "{DATASETS}/parts/plate.stl"
+[targets]
+size_mm = 20
+file = "{DATASETS}/parts/plate_tags.csv"
+[camera]
+width_px = 1600
+height_px = 1200
+focal_px = [2100, 2100]
+principal_point_px = [799.5, 599.5]
+distortion = [-0.08, 0.02, 0.0003, -0.0002]
+[viewpoints]
+radius_mm = 600
+elevation_deg = [20, 90]
+max_images = 8
+[search]
+population = 40
+generations = 10
+max_networks = 12
+"""
+ROBOT = """[robot]
+name = "ur10"
+base_position_mm = [-600, 0, 0]
+"""
+
+
+def design(folder, study, *options):
+    path = folder / "study.toml"
+    path.write_text(study)
+    command = [sys.executable, "-m", "netdesign", "design", str(path), "-o", str(folder / "run"), *options]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module", params=["workspace", "joint"])
+def run(request, tmp_path_factory):
+    """A finished design over the plate, with and without a robot."""
+    folder = tmp_path_factory.mktemp(request.param)
+    result = design(folder, STUDY + (ROBOT if request.param == "joint" else ""))
+    assert result.returncode == 0, result.stderr
+    return folder / "run"
+
+
+def test_objectives_recomputed_in_plain_numpy(run):
+    again = Recomputed(run)
+    assert len(again.design["networks"]) >= 4
+    for network in again.design["networks"]:
+        poses = np.array(network["world_from_cam_mm"])
+        f1, rays = again.f1(poses)
+        assert f1 == pytest.approx(network["objectives"][0], rel=1e-9)
+        assert network["objectives"][2] == len(poses)
+        assert rays.tolist() == network["rays"]
+        assert rays.min() >= 3
+        joints = network["joints_rad"]
+        nodes = poses[:, :3, 3] if joints is None else np.array(joints)
+        distance = np.linalg.norm(nodes[:, None] - nodes, axis=2)
+        assert path_length(distance, range(len(nodes))) == pytest.approx(network["objectives"][1], rel=1e-9)
+        best = min(nearest_neighbour_3opt(distance, start) for start in range(len(nodes)))
+        assert network["objectives"][1] <= best * (1 + 1e-9)
+
+
+def test_no_network_of_the_front_is_dominated(run):
+    networks = json.loads((run / "design.json").read_text())["networks"]
+    values = np.array([network["objectives"] for network in networks])
+    for one in values:
+        dominated_by = np.all(values <= one, axis=1) & np.any(values < one, axis=1)
+        assert not dominated_by.any()
+    for size in np.unique(values[:, 2]):
+        layer = values[values[:, 2] == size]
+        layer = layer[np.argsort(-layer[:, 0])]
+        assert np.all(np.diff(layer[:, 1]) > 0)
+    assert [network["id"] for network in networks] == list(range(len(networks)))
+    ratios = [network["bound_ratio"] for network in networks]
+    assert min(ratios) >= 1.0
+
+
+def test_one_or_two_threads_the_same_bytes(run, tmp_path):
+    study = STUDY + (ROBOT if "[robot]" in (run / "study.toml").read_text() else "")
+    texts = set()
+    for threads in ("1", "2"):
+        folder = tmp_path / threads
+        folder.mkdir()
+        assert design(folder, study, "--threads", threads).returncode == 0
+        texts.add((folder / "run" / "design.json").read_bytes())
+    assert texts == {(run / "design.json").read_bytes()}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "status", "says"),
+    [
+        ("min_rays", "", 3, "robot"),
+        ("max_incidence_deg", "max_incidence_deg = 2", 3, "seen"),
+        ("too few", "min_rays = 3", 3, "max_images"),
+    ],
+    ids=["out of reach", "seen by nobody", "too few images"],
+)
+def test_infeasible_studies_are_one_line_and_status_3(tmp_path, old, new, status, says):
+    study = STUDY
+    if old == "min_rays":
+        study += ROBOT.replace("-600, 0, 0", "-5000, 0, 0")
+    elif old == "max_incidence_deg":
+        study += f"[visibility]\n{new}\n"
+    else:
+        study = study.replace("max_images = 8", "max_images = 2")
+    result = design(tmp_path, study)
+    assert result.returncode == status, result.stderr
+    lines = [line for line in result.stderr.splitlines() if line.startswith("netdesign:")]
+    assert len(lines) == 1
+    assert says in lines[0]
+    assert "Traceback" not in result.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_folder_holds_one_study(run, tmp_path):
+    study = tmp_path / "study.toml"
+    study.write_text(STUDY.replace('"small"', '"other"'))
+    before = (run / "design.json").read_bytes()
+    command = [sys.executable, "-m", "netdesign", "design", str(study), "-o", str(run)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert "another" in result.stderr
+    assert (run / "design.json").read_bytes() == before

@@ -8,8 +8,7 @@ from netdesign.model.scene import Part, Scene
 from netdesign.photogrammetry.bvh import TriangleTree
 from netdesign.photogrammetry.occlusion import cone_is_free, neighbours
 from netdesign.photogrammetry.visibility import sightings
-from netdesign.placement.visibility_cells import pose_on_sphere, spread_angle
-from netdesign.placement.visibility_map import VisibilityMap, cell_index, field_bounds
+from netdesign.placement.visibility_map import VisibilityMap, cell_index, field_bounds, spread_angle
 from tests.scenes import CAMERA, LIMITS, box_scene, plate_scene, sphere
 from tests.test_visibility import bracket_scene
 
@@ -103,14 +102,6 @@ def test_cells_partition_the_admissible_range(azimuth):
         assert cell_index(low - 0.1, beta, grid_map.grid) == 0
         assert cell_index(high + 0.1, beta, grid_map.grid) == grid_map.columns - 1
     assert cell_index(low, 2.0, grid_map.grid) == (grid_map.rows - 1) * grid_map.columns
-
-
-def test_the_kernel_s_pose_is_that_of_the_viewing_sphere():
-    stations = replace(sphere(roll=0.7), centre=np.array([0.1, -0.2, 0.3]))
-    for viewpoint in ([0.3, 0.8], [-2.0, 1.5], [1.0, -1.2], [0.0, np.pi / 2]):
-        pose = np.zeros((4, 4))
-        pose_on_sphere(*viewpoint, 0.7, stations.centre, stations.radius, pose)
-        np.testing.assert_allclose(pose[:3], stations.cameras(np.array(viewpoint))[:3], atol=1e-14)
 
 
 def test_the_spread_of_a_cell_is_its_largest_angle():

@@ -13,7 +13,6 @@ fails is the reason that is kept:
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +20,7 @@ from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.scene import CORNERS_PER_TAG, Scene, Targets
 from netdesign.model.task import VisibilityLimits
-from netdesign.photogrammetry.bvh import TriangleTree, blocking_triangle
+from netdesign.photogrammetry.bvh import TriangleTree
 
 REASONS = ("seen", "behind", "incidence", "frame", "size", "depth of field", "occluded")
 SEEN, BEHIND, INCIDENCE, FRAME, SIZE, DEPTH_OF_FIELD, OCCLUDED = range(len(REASONS))
@@ -67,17 +66,45 @@ class Sight:
     """Scene, camera and limits prepared for repeated questions."""
 
     def __init__(self, scene: Scene, camera: Camera, limits: VisibilityLimits) -> None:
-        self.tree = TriangleTree.build(scene.part.triangles if limits.occlusion else np.zeros((0, 3, 3)))
+        mesh = scene.part.triangles if limits.occlusion else np.zeros((0, 3, 3))
         self.points = sight_points(scene.targets)
         self.normals = np.ascontiguousarray(scene.targets.normals)
         self.settings = sight_settings(camera, limits, scene.targets.size_m)
+        self.shadowed = shadowed(mesh, self.points, self.normals, self.settings[16])
+        self.tree = TriangleTree.build(mesh if self.shadowed.any() else mesh[:0])
 
     def look(self, world_from_cam: Floats) -> Sightings:
         """Return the sightings of images with poses (n, 4, 4)."""
-        poses = np.ascontiguousarray(world_from_cam, dtype=np.float64)
-        tree = self.tree
-        reason = _look(poses, self.points, self.normals, self.settings, tree.bounds, tree.starts, tree.triangles)
+        poses = np.asarray(world_from_cam, dtype=np.float64)
+        reason = np.zeros((len(poses), len(self.points)), dtype=np.int8)
+        at_once = max(1, 200_000 // max(len(self.points), 1))
+        for first in range(0, len(poses), at_once):
+            images = slice(first, first + at_once)
+            reason[images] = _unobstructed(poses[images], self.points[:, :CORNERS_PER_TAG], self.normals, self.settings)
+        image, tag = np.nonzero((reason == SEEN) & self.shadowed)
+        if image.size:
+            reason[image, tag] = np.where(self._blocked(poses[image, :3, 3], tag), OCCLUDED, SEEN)
         return Sightings(reason=reason)
+
+    def _blocked(self, stations: Floats, tag: Ints) -> Bools:
+        """(k,): the mesh hides a corner or the centre of tag (k,) from a camera at stations (k, 3)."""
+        ends = self.points[tag]
+        height = np.einsum("kpj,kj->kp", stations[:, None] - ends, self.normals[tag])
+        low = height <= self.settings[16]
+        share = self.settings[16] / np.where(low, 1.0, height)
+        ends = ends + share[..., None] * (stations[:, None] - ends)
+        origins = np.repeat(stations, ends.shape[1], axis=0)
+        hit = self.tree.blocked(origins, ends.reshape(-1, 3)).reshape(low.shape)
+        return np.asarray((low | hit).any(axis=1))
+
+
+def shadowed(mesh: Floats, points: Floats, normals: Floats, clearance: float) -> Bools:
+    """Return (g,) whether a vertex of the mesh (t, 3, 3) rises above a tag's plane: on a convex part none does."""
+    vertices = np.unique(mesh.reshape(-1, 3), axis=0)
+    if not len(vertices):
+        return np.zeros(len(points), dtype=bool)
+    heights = (vertices @ normals.T).max(axis=0) - np.einsum("gj,gj->g", points[:, 4], normals)
+    return np.asarray(heights > clearance)
 
 
 def sight_points(targets: Targets) -> Floats:
@@ -114,77 +141,30 @@ def monotone_radius_squared(camera: Camera) -> float:
     return float(positive.min()) if positive.size else float("inf")
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _look(
-    poses: Floats, points: Floats, normals: Floats, settings: Floats, bounds: Floats, starts: Ints, triangles: Floats
-) -> NDArray[np.int8]:
-    reason = np.zeros((len(poses), len(points)), np.int8)
-    for i in range(len(poses)):
-        for g in range(len(points)):
-            outcome = unobstructed(poses[i], points[g], normals[g], settings)
-            if outcome == SEEN:
-                x, y, z = poses[i, 0, 3], poses[i, 1, 3], poses[i, 2, 3]
-                if tag_blocked(x, y, z, points[g], normals[g], settings[16], bounds, starts, triangles):
-                    outcome = OCCLUDED
-            reason[i, g] = outcome
-    return reason
-
-
-@numba.njit(cache=True, error_model="numpy")
-def tag_blocked(
-    cx: float, cy: float, cz: float, points: Floats, normal: Floats, clearance: float, bounds: Floats, starts: Ints,
-    triangles: Floats,
-) -> bool:  # fmt: skip
-    """Tell whether the mesh hides one of a tag's five points (5, 3) from a camera at c."""
-    for k in range(4, -1, -1):
-        dx, dy, dz = points[k, 0] - cx, points[k, 1] - cy, points[k, 2] - cz
-        height = -(dx * normal[0] + dy * normal[1] + dz * normal[2])
-        if height <= clearance:
-            return True
-        share = 1.0 - clearance / height
-        if blocking_triangle(cx, cy, cz, dx * share, dy * share, dz * share, bounds, starts, triangles) >= 0:
-            return True
-    return False
-
-
-@numba.njit(cache=True, error_model="numpy")
-def unobstructed(pose: Floats, points: Floats, normal: Floats, settings: Floats) -> int:
-    """Return the first reason, but for occlusion, why a tag with points (5, 3) is not seen; 0 when it is."""
-    fx, fy, cx, cy = settings[0], settings[1], settings[2], settings[3]
-    k1, k2, p1, p2 = settings[4], settings[5], settings[6], settings[7]
-    behind = incidence = frame = blurred = False
-    shortest = np.inf
-    first_x = first_y = last_x = last_y = 0.0
-    for k in range(4):
-        dx, dy, dz = points[k, 0] - pose[0, 3], points[k, 1] - pose[1, 3], points[k, 2] - pose[2, 3]
-        z = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
-        if z <= 0.0:
-            behind = True
-            break
-        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-        if -(dx * normal[0] + dy * normal[1] + dz * normal[2]) < settings[12] * distance:
-            incidence = True
-        x = (pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz) / z
-        y = (pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz) / z
-        s = x * x + y * y
-        radial = 1.0 + s * (k1 + s * k2)
-        u = fx * (x * radial + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)) + cx
-        v = fy * (y * radial + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y) + cy
-        if s > settings[17] or not (settings[8] <= u <= settings[9] and settings[10] <= v <= settings[11]):
-            frame = True
-        if z < settings[14] or z > settings[15]:
-            blurred = True
-        if k == 0:
-            first_x, first_y = u, v
-        else:
-            shortest = min(shortest, (u - last_x) ** 2 + (v - last_y) ** 2)
-        last_x, last_y = u, v
-    if behind:
-        return BEHIND
-    if incidence:
-        return INCIDENCE
-    if frame:
-        return FRAME
-    if min(shortest, (first_x - last_x) ** 2 + (first_y - last_y) ** 2) < settings[13] ** 2:
-        return SIZE
-    return DEPTH_OF_FIELD if blurred else SEEN
+def _unobstructed(poses: Floats, corners: Floats, normals: Floats, settings: Floats) -> NDArray[np.int8]:
+    """First reason, but for occlusion, why each of the n images does not see tags with corners (g, 4, 3): (n, g)."""
+    fx, fy, cx, cy, k1, k2, p1, p2 = settings[:8]
+    offset = corners[None] - poses[:, None, None, :3, 3]
+    inside = offset @ poses[:, None, :3, :3]
+    z = inside[..., 2]
+    behind = z <= 0.0
+    x, y = np.moveaxis(inside[..., :2] / np.where(behind, 1.0, z)[..., None], -1, 0)
+    s = x * x + y * y
+    radial = 1.0 + s * (k1 + s * k2)
+    u = fx * (x * radial + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)) + cx
+    v = fy * (y * radial + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y) + cy
+    facing = -np.einsum("ngkj,gj->ngk", offset, normals)
+    oblique = facing < settings[12] * np.linalg.norm(offset, axis=-1)
+    left, right, top, bottom = settings[8:12]
+    outside = (s > settings[17]) | (u < left) | (u > right) | (v < top) | (v > bottom)
+    edges = (u - np.roll(u, 1, axis=-1)) ** 2 + (v - np.roll(v, 1, axis=-1)) ** 2
+    blurred = (z < settings[14]) | (z > settings[15])
+    tests = [
+        behind.any(axis=-1),
+        oblique.any(axis=-1),
+        outside.any(axis=-1),
+        edges.min(axis=-1, initial=np.inf) < settings[13] ** 2,
+        blurred.any(axis=-1),
+    ]
+    reason = np.select(tests, [BEHIND, INCIDENCE, FRAME, SIZE, DEPTH_OF_FIELD], default=SEEN)
+    return np.asarray(reason, dtype=np.int8)

@@ -29,10 +29,12 @@ import numpy as np
 
 from netdesign.model.arrays import Floats, Ints
 from netdesign.model.camera import Camera
+from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.photogrammetry.precision import corner_sigma
 from netdesign.placement.information import largest_gains, normal_matrices, quadratic_forms
-from netdesign.placement.visibility_map import VisibilityMap, Words, field_bounds
+from netdesign.placement.visibility_cells import Words
+from netdesign.placement.visibility_map import VisibilityMap, field_bounds, spread_angle
 
 CANDIDATE_STEP = np.radians(4.0)
 ROUNDS = 6
@@ -47,8 +49,8 @@ ROUNDING = 1e-9
 class _Views:
     """What the kernels need about a study; see ``information`` for the units."""
 
+    map: VisibilityMap
     bits: Words
-    grid: Floats
     radius: float
     points: Floats
     normals: Floats
@@ -57,17 +59,21 @@ class _Views:
 
     def matrices(self, cells: Ints) -> Floats:
         """(c, 6 m) normal matrices in the middle of the cells."""
-        found: Floats = normal_matrices(
-            cells, self.grid, self.bits, self.radius, self.points, self.normals, self.gains, self.sigmas
-        )
+        visible = np.repeat(self.map.possible_tags(cells), CORNERS_PER_TAG, axis=1)
+        viewpoints = self.map.centres[cells]
+        found = normal_matrices(viewpoints, visible, self.radius, self.points, self.normals, self.gains, self.sigmas)
         return found.reshape(len(cells), -1)
 
     def largest(self, cells: Ints, inverse: Floats, parts: int = 1) -> Floats:
         """(c,) upper bounds of h over the cells for Z = inverse (m, 3, 3)."""
         forms = quadratic_forms(inverse @ inverse, self.points, self.radius)
+        half_alpha, half_beta = (half / parts for half in self.map.half_steps)
+        beta = self.map.grid[3] + half_beta * (1 + 2 * np.arange(parts * self.map.rows))
+        spreads = spread_angle(beta, np.array(half_alpha), np.array(half_beta)).reshape(-1, parts)
         found: Floats = largest_gains(
-            cells, self.grid, parts, self.bits, self.radius, self.points, self.normals, forms, self.gains, self.sigmas
-        )
+            cells, self.map.grid, parts, spreads, self.bits, self.radius, self.points, self.normals, forms, self.gains,
+            self.sigmas,
+        )  # fmt: skip
         return found
 
 
@@ -120,8 +126,8 @@ def _views(task: Task, visibility_map: VisibilityMap) -> _Views:
     points = targets.points - sphere.centre
     return _Views(
         bits=visibility_map.sure | visibility_map.maybe,
-        grid=visibility_map.grid,
-        radius=sphere.radius,
+        map=visibility_map,
+        radius=float(sphere.radius),
         points=np.ascontiguousarray(points),
         normals=np.ascontiguousarray(targets.point_normals),
         gains=_gain_table(camera, float(field_bounds(camera, task.limits, True)[1])),

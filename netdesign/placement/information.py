@@ -20,8 +20,9 @@ delta² / 2, gradients added over the points before the norm is taken. gain and 
 import numba
 import numpy as np
 
-from netdesign.model.arrays import Floats, Ints
-from netdesign.placement.visibility_cells import spread_angle
+from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.frames import sphere_directions
+from netdesign.placement.visibility_cells import Words
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -60,69 +61,58 @@ def weight(
     return float(best * sigmas[row, column])
 
 
-@numba.njit(cache=True, error_model="numpy")
 def normal_matrices(
-    cells: Ints, grid: Floats, bits: Ints, radius: float, points: Floats, normals: Floats, gains: Floats, sigmas: Floats
+    viewpoints: Floats, visible: Bools, radius: float, points: Floats, normals: Floats, gains: Floats, sigmas: Floats
 ) -> Floats:
-    """Return (c, m, 6): xx, xy, xz, yy, yz, zz of M in the middle of each cell, omega at its best, 0 where no bit is.
+    """Return (c, m, 6): xx, xy, xz, yy, yz, zz of M for viewpoints (c, 2), 0 where not visible (c, m).
 
-    Args:
-        cells: (c,) of the map with ``grid``.  bits: (cells, words) of the tags that count.
-        points, normals: (m, 3), points relative to the sphere's centre.
+    Not a bound but the thing itself (up to the steps of the tables): it only guides the choice of Z.
     """
-    matrices = np.zeros((len(cells), len(points), 6))
-    columns = int(grid[2])
-    half_alpha, half_beta = 0.5 / grid[1], 0.5 / grid[4]
-    for index in range(len(cells)):
-        cell = cells[index]
-        alpha = grid[0] + (cell % columns + 0.5) / grid[1]
-        beta = grid[3] + (cell // columns + 0.5) / grid[4]
-        ux, uy, uz = np.cos(beta) * np.cos(alpha), np.cos(beta) * np.sin(alpha), np.sin(beta)
-        delta = spread_angle(beta, half_alpha, half_beta)
-        for j in range(len(points)):
-            tag = j >> 2
-            if not (bits[cell, tag >> 6] >> np.uint64(tag & 63)) & np.uint64(1):
-                continue
-            px, py, pz = points[j, 0], points[j, 1], points[j, 2]
-            z = radius - (ux * px + uy * py + uz * pz)
-            dx, dy, dz = px - radius * ux, py - radius * uy, pz - radius * uz
-            cx, cy, cz = py * uz - pz * uy, pz * ux - px * uz, px * uy - py * ux
-            square = dx * dx + dy * dy + dz * dz
-            distance, lateral = np.sqrt(square), np.sqrt(cx * cx + cy * cy + cz * cz)
-            cosine = -(dx * normals[j, 0] + dy * normals[j, 1] + dz * normals[j, 2]) / distance
-            w = np.sqrt(px * px + py * py + pz * pz)
-            scale = weight(z, lateral, w, cosine, distance, radius, delta, gains, sigmas) / z**4
-            matrices[index, j, 0] = scale * (square - dx * dx - cx * cx)
-            matrices[index, j, 1] = scale * (-dx * dy - cx * cy)
-            matrices[index, j, 2] = scale * (-dx * dz - cx * cz)
-            matrices[index, j, 3] = scale * (square - dy * dy - cy * cy)
-            matrices[index, j, 4] = scale * (-dy * dz - cy * cz)
-            matrices[index, j, 5] = scale * (square - dz * dz - cz * cz)
+    u = sphere_directions(viewpoints)
+    along = u @ points.T
+    offset = points[None] - radius * u[:, None]
+    across = np.cross(points[None], u[:, None])
+    square, lateral = np.einsum("cmi,cmi->cm", offset, offset), np.linalg.norm(across, axis=2)
+    z = radius - along
+    scale = np.where(visible, 1.0 / z**4, 0.0)
+    if len(gains) > 2:
+        bins = len(gains) - 1
+        scale *= gains[np.minimum((lateral / z / gains[bins]).astype(np.int64), bins - 1)]
+    rows, columns = len(sigmas) - 1, sigmas.shape[1]
+    cosine = np.clip(-np.einsum("cmi,mi->cm", offset, normals) / np.sqrt(square), 0.0, 1.0)
+    step = sigmas[rows, 1] if rows > 1 else 1.0
+    row = np.clip((z - sigmas[rows, 0]) / step, 0, rows - 1).astype(np.int64)
+    scale *= sigmas[row, np.minimum((cosine * columns).astype(np.int64), columns - 1)]
+    matrices = np.empty((*scale.shape, 6))
+    for place, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
+        diagonal = square if i == j else 0.0
+        matrices[..., place] = scale * (diagonal - offset[..., i] * offset[..., j] - across[..., i] * across[..., j])
     return matrices
 
 
 @numba.njit(cache=True, error_model="numpy")
 def largest_gains(
-    cells: Ints, grid: Floats, parts: int, bits: Ints, radius: float, points: Floats, normals: Floats, forms: Floats,
-    gains: Floats, sigmas: Floats,
+    cells: Ints, grid: Floats, parts: int, spreads: Floats, bits: Words, radius: float, points: Floats, normals: Floats,
+    forms: Floats, gains: Floats, sigmas: Floats,
 ) -> Floats:  # fmt: skip
     """Return (c,) upper bounds of Σ tr(Z_j M_j(u) Z_j) over every viewpoint of each cell.
 
     Args:
-        parts: every cell is cut into parts x parts, each bounded by itself.
+        cells: (c,) of the map with ``grid``.  parts: every cell is cut into parts x parts, each bounded by itself.
+        spreads: (rows, parts) delta of the parts of a row of cells.  bits: (cells, words) of the tags that count.
+        points, normals: (m, 3), points relative to the sphere's centre.
         forms: (m, 11) a, b, the upper triangle of C, and the curvature of ``quadratic_forms``.
-        Others: as in ``normal_matrices``.
+        gains, sigmas: as in ``weight``.
     """
     result = np.zeros(len(cells))
     columns = int(grid[2])
-    half_alpha, half_beta = 0.5 / (grid[1] * parts), 0.5 / (grid[4] * parts)
     for index in range(len(cells)):
         cell = cells[index]
         for part in range(parts * parts):
             alpha = grid[0] + (cell % columns + (part % parts + 0.5) / parts) / grid[1]
             beta = grid[3] + (cell // columns + (part // parts + 0.5) / parts) / grid[4]
             ux, uy, uz = np.cos(beta) * np.cos(alpha), np.cos(beta) * np.sin(alpha), np.sin(beta)
-            delta = spread_angle(beta, half_alpha, half_beta)
+            delta = spreads[cell // columns, part // parts]
             value = curvature = gx = gy = gz = 0.0
             for tag in range(len(points) // 4):
                 if not (bits[cell, tag >> 6] >> np.uint64(tag & 63)) & np.uint64(1):

@@ -16,12 +16,17 @@ from the sphere's centre and R the radius:
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from netdesign.model.arrays import Floats, Ints
+from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.photogrammetry.bvh import blocking_triangle
-from netdesign.photogrammetry.occlusion import LARGEST_PATCH, cone_is_covered, cone_is_free
+from netdesign.photogrammetry.occlusion import cone_is_covered, cone_is_free
 
 HIDDEN, UNDECIDED, VISIBLE = 0, 1, 2
+
+Words = NDArray[np.uint64]
+# bounds, starts, triangles, neighbours; then work space: stamps (t + 1,), queue (LARGEST_PATCH,).
+Mesh = tuple[Floats, Ints, Floats, Ints, Ints, Ints]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -124,10 +129,10 @@ def classify(
 
 @numba.njit(cache=True, error_model="numpy")
 def shadow(
-    state: int, pose: Floats, spread: float, points: Floats, normal: Floats, settings: Floats, bounds: Floats,
-    starts: Ints, triangles: Floats, across: Ints, visited: Ints, queue: Ints,
+    state: int, pose: Floats, spread: float, points: Floats, normal: Floats, settings: Floats, mesh: Mesh
 ) -> int:  # fmt: skip
     """Return ``state`` of a tag and a cell after occlusion for camera positions within ``spread`` of the pose."""
+    bounds, starts, triangles, across, visited, queue = mesh
     axis = np.empty(3)
     for trial in range(2):
         for k in range(4, -1, -1):
@@ -159,104 +164,40 @@ def shadow(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def pose_on_sphere(alpha: float, beta: float, roll: float, centre: Floats, radius: float, pose: Floats) -> None:
-    """Write into ``pose`` (4, 4) what ``ViewingSphere.cameras`` gives for one viewpoint."""
-    ux, uy, uz = np.cos(beta) * np.cos(alpha), np.cos(beta) * np.sin(alpha), np.sin(beta)
-    scale = 1.0 / max(1.0 + uz, 1e-12)
-    cos, sin = np.cos(roll), np.sin(roll)
-    x = (1.0 - ux * ux * scale, -ux * uy * scale, -ux)
-    y = (ux * uy * scale, uy * uy * scale - 1.0, uy)
-    u = (ux, uy, uz)
-    for j in range(3):
-        pose[j, 0] = cos * x[j] + sin * y[j]
-        pose[j, 1] = cos * y[j] - sin * x[j]
-        pose[j, 2] = -u[j]
-        pose[j, 3] = centre[j] + radius * u[j]
-
-
-@numba.njit(cache=True, error_model="numpy")
-def spread_angle(beta: float, half_alpha: float, half_beta: float) -> float:
-    """Return the largest angle between a direction in a cell and its middle, at elevation ``beta`` (haversine)."""
-    low, high = beta - half_beta, beta + half_beta
-    widest = 1.0 if low < 0.0 < high else max(np.cos(low), np.cos(high))
-    square = np.sin(0.5 * half_beta) ** 2 + np.cos(beta) * widest * np.sin(0.5 * min(half_alpha, np.pi)) ** 2
-    return float(2.0 * np.arcsin(min(np.sqrt(square), 1.0)))
-
-
-@numba.njit(cache=True, error_model="numpy")
 def fill(
-    grid: Floats, block: int, roll: float, free_roll: bool, centre: Floats, radius: float, points: Floats, away: Floats,
-    normals: Floats, shadowed: Floats, settings: Floats, field: Floats, tag_size: float, bounds: Floats, starts: Ints,
-    triangles: Floats, across: Ints, sure: Floats, maybe: Floats,
+    level: Ints, shape: Ints, poses: Floats, angles: Floats, radius: float, points: Floats, away: Floats,
+    normals: Floats, shadowed: Bools, settings: Floats, field: Floats, tag_size: float, mesh: Mesh | None,
+    waiting: Bools, sure: Words, maybe: Words,
 ) -> None:  # fmt: skip
-    """Set the bits of ``sure`` and ``maybe`` (cells, words): quadtree over blocks of cells, undecided tags go down.
+    """Decide the tags that wait at the blocks of one level of the quadtree; set their bits, or pass them down.
 
     Args:
-        grid: of VisibilityMap.  block: cells along the edge of a block of the coarsest level, a power of two.
+        level: (3,) cells along the edge of a block, rows and columns of blocks.  shape: (2,) rows, columns of cells.
+        poses: (blocks, 4, 4) world_from_cam in the middle of each block.  angles: (blocks, 2) delta and kappa·delta.
         shadowed: (g,) whether any part of the mesh rises above the tag's plane.
+        mesh: bounds, starts and triangles of a TriangleTree, their ``neighbours``, work space; None when nothing is
+            shadowed, and then the tests of occlusion are not even compiled.
+        waiting: (blocks, g) undecided so far; on return those to be decided at the next level.
+        sure, maybe: (cells, words), changed in place.
         Others: as in ``classify`` and ``occlusion``.
     """
-    columns, rows = int(grid[2]), int(grid[5])
-    tags = len(points)
-    depth = 4 * (int(np.log2(block)) + 1)
-    stack = np.empty((depth, 3), np.int64)
-    waiting = np.empty((depth, tags), np.int64)
-    count = np.zeros(depth, np.int64)
-    pose = np.zeros((4, 4))
-    left = np.empty(tags, np.int64)
-    visited, queue = np.zeros(len(triangles) + 1, np.int64), np.empty(LARGEST_PATCH, np.int64)
-    for top_row in range(0, rows, block):
-        for top_column in range(0, columns, block):
-            stack[0, 0], stack[0, 1], stack[0, 2] = top_row, top_column, block
-            count[0] = tags
-            for g in range(tags):
-                waiting[0, g] = g
-            top = 1
-            while top > 0:
-                top -= 1
-                row, column, size = stack[top, 0], stack[top, 1], stack[top, 2]
-                row_end, column_end = min(row + size, rows), min(column + size, columns)
-                beta = grid[3] + 0.5 * (row + row_end) / grid[4]
-                alpha = grid[0] + 0.5 * (column + column_end) / grid[1]
-                delta = spread_angle(beta, 0.5 * (column_end - column) / grid[1], 0.5 * (row_end - row) / grid[4])
-                delta += 1e-12
-                polar = 0.5 * np.pi - beta + delta
-                turn = delta if free_roll else delta / max(np.cos(0.5 * min(polar, np.pi)), 1e-9)
-                pose_on_sphere(alpha, beta, roll, centre, radius, pose)
+    size, block_columns = level[0], level[2]
+    for block in range(len(poses)):
+        first_row, first_column = (block // block_columns) * size, (block % block_columns) * size
+        delta, turn = angles[block, 0], angles[block, 1]
+        for g in range(len(points)):
+            if not waiting[block, g]:
+                continue
+            state = classify(
+                poses[block], radius, delta, turn, points[g], away[g], normals[g], settings, field, tag_size
+            )
+            if mesh is not None and shadowed[g] and (state == VISIBLE or (state == UNDECIDED and size == 1)):
                 spread = 2.0 * radius * np.sin(0.5 * delta)
-                remaining = 0
-                for index in range(count[top]):
-                    g = waiting[top, index]
-                    state = classify(
-                        pose, radius, delta, turn, points[g], away[g], normals[g], settings, field, tag_size
-                    )
-                    if shadowed[g] != 0.0 and (state == VISIBLE or (state == UNDECIDED and size == 1)):
-                        state = shadow(
-                            state, pose, spread, points[g], normals[g], settings, bounds, starts, triangles, across,
-                            visited, queue,
-                        )  # fmt: skip
-                    if state == HIDDEN:
-                        continue
-                    if state == UNDECIDED and size > 1:
-                        left[remaining] = g
-                        remaining += 1
-                        continue
-                    bit = np.uint64(1) << np.uint64(g & 63)
-                    for i in range(row, row_end):
-                        for j in range(column, column_end):
-                            if state == VISIBLE:
-                                sure[i * columns + j, g >> 6] |= bit
-                            else:
-                                maybe[i * columns + j, g >> 6] |= bit
-                if remaining == 0:
-                    continue
-                half = size // 2
-                for quarter in range(4):
-                    next_row, next_column = row + half * (quarter >> 1), column + half * (quarter & 1)
-                    if next_row >= rows or next_column >= columns:
-                        continue
-                    stack[top, 0], stack[top, 1], stack[top, 2] = next_row, next_column, half
-                    count[top] = remaining
-                    for index in range(remaining):
-                        waiting[top, index] = left[index]
-                    top += 1
+                state = shadow(state, poses[block], spread, points[g], normals[g], settings, mesh)
+            waiting[block, g] = state == UNDECIDED and size > 1
+            if state == HIDDEN or waiting[block, g]:
+                continue
+            bits = sure if state == VISIBLE else maybe
+            for row in range(first_row, min(first_row + size, shape[0])):
+                for column in range(first_column, min(first_column + size, shape[1])):
+                    bits[row * shape[1] + column, g >> 6] |= np.uint64(1) << np.uint64(g & 63)

@@ -14,18 +14,16 @@ from tempfile import NamedTemporaryFile
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.scene import Scene
 from netdesign.model.task import ViewingSphere, VisibilityLimits
 from netdesign.photogrammetry.bvh import TriangleTree
-from netdesign.photogrammetry.occlusion import neighbours
-from netdesign.photogrammetry.visibility import monotone_radius_squared, sight_points, sight_settings
-from netdesign.placement.visibility_cells import fill
+from netdesign.photogrammetry.occlusion import LARGEST_PATCH, neighbours
+from netdesign.photogrammetry.visibility import monotone_radius_squared, shadowed, sight_points, sight_settings
+from netdesign.placement.visibility_cells import Words, fill
 
-Words = NDArray[np.uint64]
 VERSION = 1  # of the kernels: part of the key of the cache
 COARSEST = 16  # cells along the edge of a block of the coarsest level
 
@@ -64,15 +62,10 @@ class VisibilityMap:
         path = _cache_path(points, normals, settings, field, mesh, grid, station)
         rows_of_bits = _read(path)
         if rows_of_bits is None:
-            tree = TriangleTree.build(mesh)
-            cells, words = int(grid[2] * grid[5]), -(-len(points) // 64)
-            rows_of_bits = np.zeros((2, cells, words), np.uint64)
-            fill(
-                grid, COARSEST, roll, sphere.roll is None, sphere.centre, sphere.radius, points,
-                np.linalg.norm(points - sphere.centre, axis=2), normals, _shadowed(mesh, points, normals, settings[16]),
-                settings, field, scene.targets.size_m, tree.bounds, tree.starts, tree.triangles, neighbours(tree),
-                rows_of_bits[0], rows_of_bits[1],
-            )  # fmt: skip
+            above = shadowed(mesh, points, normals, settings[16])
+            rows_of_bits = _decide(
+                sphere, grid, mesh if above.any() else mesh[:0], above, points, normals, settings, field
+            )
             _write(path, rows_of_bits)
         sure, maybe = rows_of_bits
         return VisibilityMap(sure=sure, maybe=maybe, tag_count=len(points), grid=grid, free_roll=sphere.roll is None)
@@ -173,13 +166,50 @@ def _grid(sphere: ViewingSphere, step: float) -> Floats:
     return np.array(numbers)
 
 
-def _shadowed(mesh: Floats, points: Floats, normals: Floats, clearance: float) -> Floats:
-    """(g,) 1.0 when a vertex of the mesh rises above the tag's plane: on a convex part none does."""
-    vertices = np.unique(mesh.reshape(-1, 3), axis=0)
-    if not len(vertices):
-        return np.zeros(len(points))
-    heights = (vertices @ normals.T).max(axis=0) - np.einsum("gj,gj->g", points[:, 4], normals)
-    return np.asarray(heights > clearance, dtype=np.float64)
+def _decide(
+    sphere: ViewingSphere, grid: Floats, mesh: Floats, above: Bools, points: Floats, normals: Floats, settings: Floats,
+    field: Floats,
+) -> Words:  # fmt: skip
+    """(2, cells, words) sure and maybe: level by level from blocks of COARSEST cells to single cells."""
+    rows, columns, free_roll = int(grid[5]), int(grid[2]), sphere.roll is None
+    rows_of_bits = np.zeros((2, rows * columns, -(-len(points) // 64)), np.uint64)
+    tree = TriangleTree.build(mesh)
+    space = (np.zeros(len(mesh) + 1, np.int64), np.empty(LARGEST_PATCH, np.int64))
+    surface = (tree.bounds, tree.starts, tree.triangles, neighbours(tree), *space) if len(mesh) else None
+    tag_size = float(np.linalg.norm(points[0, 1] - points[0, 0]))
+    waiting = np.ones((-(-rows // COARSEST) * -(-columns // COARSEST), len(points)), bool)
+    size = COARSEST
+    while True:
+        across, along = -(-rows // size), -(-columns // size)
+        row, column = np.arange(across) * size, np.arange(along) * size
+        low, high = row, np.minimum(row + size, rows)
+        left, right = column, np.minimum(column + size, columns)
+        beta, half_beta = grid[3] + 0.5 * (low + high) / grid[4], 0.5 * (high - low) / grid[4]
+        alpha, half_alpha = grid[0] + 0.5 * (left + right) / grid[1], 0.5 * (right - left) / grid[1]
+        delta = spread_angle(beta[:, None], half_alpha[None], half_beta[:, None]) + 1e-12
+        polar = np.minimum(0.5 * np.pi - beta[:, None] + delta, np.pi)
+        turn = delta if free_roll else delta / np.maximum(np.cos(0.5 * polar), 1e-9)
+        viewpoints = np.stack(np.broadcast_arrays(alpha[None], beta[:, None]), axis=-1).reshape(-1, 2)
+        fill(
+            np.array([size, across, along]), np.array([rows, columns]), sphere.cameras(viewpoints),
+            np.stack([delta.ravel(), turn.ravel()], axis=1), float(sphere.radius), points,
+            np.linalg.norm(points - sphere.centre, axis=2), normals, above, settings, field, tag_size, surface, waiting,
+            rows_of_bits[0], rows_of_bits[1],
+        )  # fmt: skip
+        if size == 1:
+            return rows_of_bits
+        size //= 2
+        # Each block hands what still waits to its four quarters (fewer at the upper edges of the grid).
+        waiting = waiting.reshape(across, along, -1).repeat(2, axis=0).repeat(2, axis=1)
+        waiting = np.ascontiguousarray(waiting[: -(-rows // size), : -(-columns // size)]).reshape(-1, len(points))
+
+
+def spread_angle(beta: Floats, half_alpha: Floats, half_beta: Floats) -> Floats:
+    """Return the largest angle between a direction in a cell and its middle, at elevation ``beta`` (haversine)."""
+    low, high = beta - half_beta, beta + half_beta
+    widest = np.where((low < 0.0) & (high > 0.0), 1.0, np.maximum(np.cos(low), np.cos(high)))
+    square = np.sin(0.5 * half_beta) ** 2 + np.cos(beta) * widest * np.sin(0.5 * np.minimum(half_alpha, np.pi)) ** 2
+    return np.asarray(2.0 * np.arcsin(np.minimum(np.sqrt(square), 1.0)))
 
 
 def _unpack(rows: Words, count: int) -> Bools:

@@ -151,7 +151,7 @@ class JointMap:
         ]
 
     def share(self, elevation: tuple[float, float] | None = None, samples: int = 8000) -> dict[str, float]:
-        """Return the share of the sphere's admissible area for each reason, from a golden-angle lattice of viewpoints."""
+        """Return the share of the sphere's admissible area for each reason, from a golden-angle lattice."""
         low, high = elevation or self.sphere.elevation
         alpha_low, alpha_high = self.sphere.azimuth
         index = np.arange(samples) + 0.5

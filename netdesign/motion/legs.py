@@ -1,6 +1,9 @@
 """Between two stations: is the straight joint line free, and if not, over which via points is it?"""
 
+import itertools
+
 import numpy as np
+from scipy.sparse.csgraph import dijkstra
 
 from netdesign.model.arrays import Floats
 from netdesign.motion.collision import FREE, leg_state
@@ -9,8 +12,10 @@ from netdesign.motion.joint_map import JointMap
 # 0.02 rad moves the tip of an outstretched UR10 by 26 mm: between two tests it stays within the margin of 20 mm.
 _STEP = 0.02
 _TURN = 2.0 * np.pi
-_NEAREST_VIAS = 150
-_ROADMAP = 40
+_ROADMAP = 200
+_NEIGHBOURS = 12
+_LAZY_ROUNDS = 600
+_STOP = 0.1  # rad: what a via point costs on top of its way
 
 
 class Legs:
@@ -35,26 +40,45 @@ class Legs:
         return self._known[key]
 
     def detour(self, start: Floats, end: Floats) -> Floats | None:
-        """Return via points (k, r), k <= 2, of a free way from start to end, None when there is none among those tried.
+        """Return via points (k, r) of a free way from start to end (r,), None when none is found.
 
-        Candidates are the free joints of a coarse subset of the map's nodes, each in the turn nearest to the leg.
+        A lazy roadmap: nodes are free joints of a coarse subset of the map, each in the turn nearest to the leg, joined
+        to their nearest; the shortest way is tested leg by leg, legs that collide are taken out, and so on. Legs must
+        be free for the capsules, which contain the meshes. Source: R. Bohlin, L. E. Kavraki, ICRA 2000 (lazy PRM).
         """
-        candidates = self._candidates(0.5 * (start + end))
-        way = np.linalg.norm(candidates - start, axis=1) + np.linalg.norm(candidates - end, axis=1)
-        order = np.argsort(way, kind="stable")
-        for index in order[:_NEAREST_VIAS]:
-            via = candidates[index]
-            if not self.contact(start, via) and not self.contact(via, end):
-                return np.array(via[None])
-        near = candidates[order[:_ROADMAP]]
-        leaving = [via for via in near if not self.contact(start, via)]
-        arriving = [via for via in near if not self.contact(via, end)]
-        pairs = [(first, second) for first in leaving for second in arriving]
-        pairs.sort(key=lambda pair: _length(np.stack([start, pair[0], pair[1], end])))
-        for first, second in pairs[:_NEAREST_VIAS]:
-            if not self.contact(first, second):
-                return np.stack([first, second])
+        nodes = self._candidates(0.5 * (start + end))
+        way = np.linalg.norm(nodes - start, axis=1) + np.linalg.norm(nodes - end, axis=1)
+        nodes = np.concatenate([[start, end], nodes[np.argsort(way, kind="stable")[:_ROADMAP]]])
+        distance = np.linalg.norm(nodes[:, None] - nodes, axis=2)
+        near = np.argsort(distance, axis=1, kind="stable")[:, 1 : _NEIGHBOURS + 1]
+        weights = np.zeros_like(distance)
+        rows = np.repeat(np.arange(len(nodes)), near.shape[1])
+        weights[rows, near.ravel()] = distance[rows, near.ravel()] + _STOP
+        weights[:2] = distance[:2] + _STOP
+        weights = np.maximum(weights, weights.T)
+        weights[0, 1] = weights[1, 0] = 0.0
+        np.fill_diagonal(weights, 0.0)
+        tested: set[tuple[int, int]] = set()
+        for _ in range(_LAZY_ROUNDS):
+            _, before = dijkstra(weights, indices=0, return_predecessors=True)
+            path = [1]
+            while path[-1] != 0 and before[path[-1]] >= 0:
+                path.append(int(before[path[-1]]))
+            if path[-1] != 0:
+                return None
+            colliding = False
+            for a, b in itertools.pairwise(path[::-1]):
+                if (a, b) not in tested and not self._clear(nodes[a], nodes[b]):
+                    weights[a, b] = weights[b, a] = 0.0
+                    colliding = True
+                    break
+                tested |= {(a, b), (b, a)}
+            if not colliding:
+                return np.array(nodes[path[-2:0:-1]])
         return None
+
+    def _clear(self, start: Floats, end: Floats) -> bool:
+        return bool(leg_state(self._arm.body, start, end, _STEP) == FREE)
 
     def _candidates(self, middle: Floats) -> Floats:
         arrays, placed = self._map.arrays, self._arm.placed
@@ -64,7 +88,3 @@ class Legs:
         turned = joints + np.where(placed.wraps, _TURN * np.rint((middle - joints) / _TURN), 0.0)
         inside = (turned >= placed.lower) & (turned <= placed.upper)
         return np.ascontiguousarray(np.where(inside, turned, joints))
-
-
-def _length(way: Floats) -> float:
-    return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())

@@ -103,7 +103,7 @@ def conflict(front, price):
 def limited_is_valid(front, ratio):
     """(vi) Limited error propagation is valid for well designed networks: near the full bundle's sigma.
 
-    Well designed is each size's network of best sigma: the median of total over limited sigma over these. Beside it that
+    Well designed is each size's network of best sigma: the median of total over limited sigma of these. Beside it that
     of the whole front, whose short tours are weak networks, and the rank correlation of the two criteria.
     """
     limited = np.array([network["rms_sigma_um"] for network in front["networks"]])

@@ -25,7 +25,10 @@ claims = module("claims")
 run = module("run")
 
 
-def front_of(sigma_of, sizes=range(4, 13), tours=tuple(np.linspace(1.0, 6.0, 16)), total=lambda n, tour: 1.1):
+TOURS = tuple(np.linspace(1.0, 6.0, 16))
+
+
+def front_of(sigma_of, sizes=range(4, 13), tours=TOURS, total=lambda n, tour: 1.1):
     """A front with the same tours in every layer and sigma = sigma_of(n, tour) in mm."""
     return {
         "networks": [

@@ -1,13 +1,6 @@
 """An image set, photographs of a tagged part, made into an observation set.
 
-The folder holds
-
-    camera.toml         [camera] as in a study; optional [targets] with family and size_mm (edge of the black squares)
-    images/*.png …      the photographs, or beside camera.toml
-    targets.csv         nominal tags as in a study (tag,x_mm,y_mm,z_mm,nx,ny,nz,ux,uy,uz), or
-    tags.csv            tag,size_mm, when nothing is known of the part; or nothing: every tag of the family counts
-
-With targets.csv the nominal coordinates are the approximate values and the world frame. Without, the world is the frame
+What the folder holds is told in ``files/photo_folder.py``. With targets.csv the nominal coordinates are the approximate values and the world frame. Without, the world is the frame
 of the tag seen most often, and the mean edge of the tags gives the scale.
 """
 
@@ -16,16 +9,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from pydantic import ValidationError
 
 from netdesign.adjustment.estimate import estimate
 from netdesign.adjustment.initial import TagSighting, poses_and_tags, poses_on_known_tags, square
 from netdesign.adjustment.problem import BundleProblem
 from netdesign.adjustment.solver import solve
-from netdesign.errors import InfeasibleError, InputError
-from netdesign.files.observations import ObservationSet, csv_rows
-from netdesign.files.parts import TAG_COUNT, load_targets
-from netdesign.files.study_text import first_problem, read_toml
+from netdesign.errors import InfeasibleError
+from netdesign.files.observations import ObservationSet
+from netdesign.files.photo_folder import photos_in, read_camera_and_targets
 from netdesign.imageset import measure_images
 from netdesign.imaging.detect import pose_from_tag
 from netdesign.imaging.measure import Gates, TagMeasurement
@@ -36,11 +27,8 @@ from netdesign.model.frames import pose, transform
 from netdesign.model.network import Observations
 from netdesign.model.progress import Progress
 from netdesign.model.scene import CORNERS_PER_TAG, Targets
-from netdesign.model.study import CameraTable
 from netdesign.photogrammetry.connectivity import listed, named
 
-SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
-MM = 1e-3
 LOOSE_CHI2 = 1e6  # with a sigma given by the user the photometric misfit of a tag is not judged
 
 
@@ -58,12 +46,9 @@ class PhotoSet:
 
 def is_photo_set(folder: Path) -> bool:
     """Tell whether the folder has a camera.toml and photographs, and is no observation set with measured points."""
-    return (folder / "camera.toml").is_file() and not (folder / "observations.csv").is_file() and bool(_photos(folder))
-
-
-def _photos(folder: Path) -> list[Path]:
-    place = folder / "images" if (folder / "images").is_dir() else folder
-    return sorted(path for path in place.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    return (
+        (folder / "camera.toml").is_file() and not (folder / "observations.csv").is_file() and bool(photos_in(folder))
+    )
 
 
 def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress) -> PhotoSet:
@@ -77,8 +62,8 @@ def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress) -> 
         InputError: camera.toml, targets.csv or tags.csv is wrong.
         InfeasibleError: too few tags are found, or nothing ties the images together.
     """
-    photos = _photos(folder)
-    camera, targets, known = _camera_and_targets(folder)
+    photos = photos_in(folder)
+    camera, targets, known = read_camera_and_targets(folder)
     gates = None if sigma_px is None else Gates(chi2_base=LOOSE_CHI2)
     measured = measure_images(photos, camera, targets, gates=gates, progress=progress)
     good = [[tag for tag in tags if not tag.rejected] for tags in measured]
@@ -99,71 +84,15 @@ def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress) -> 
         notes.append(f"{len(refused)} tag image(s) were not believed, the first because: {refused[0]}")
     kept_names = tuple(named(names, seen))
     kept = [tags for tags in good if tags]
-    found = _on_nominal(kept, kept_names, camera, targets, sigma_px) if known else None
-    return PhotoSet(
-        observations=found or _on_tags_alone(kept, kept_names, camera, targets, sigma_px), notes=tuple(notes)
-    )
-
-
-def _camera_and_targets(folder: Path) -> tuple[Camera, Targets, bool]:
-    """Return the camera, the tags that may occur, and whether their nominal places are known."""
-    path = folder / "camera.toml"
-    content = read_toml(path)
-    try:
-        table = CameraTable.model_validate(content.get("camera", content))
-    except ValidationError as error:
-        raise InputError(f"{path}: {first_problem(error, CameraTable)}") from None
-    camera = Camera(
-        width_px=table.width_px,
-        height_px=table.height_px,
-        focal_px=np.array(table.focal_px),
-        principal_point_px=np.array(table.principal_point_px),
-        distortion=np.array(table.distortion),
-        sigma_px=table.sigma_px,
-        blur_px=table.blur_px,
-        full_well_e=table.full_well_e,
-        read_noise_e=table.read_noise_e,
-    )
-    tags = content.get("targets", {}) if "camera" in content else {}
-    family = tags.get("family", "tag36h11")
-    if family not in TAG_COUNT:
-        raise InputError(f"{path}: targets.family: expected one of {', '.join(TAG_COUNT)}, found {family!r}")
-    size, ids = tags.get("size_mm"), np.arange(TAG_COUNT[family])
-    if (folder / "tags.csv").is_file():
-        ids, size = _tag_list(folder / "tags.csv")
-    if not (isinstance(size, int | float) and size > 0):
-        raise InputError(
-            f"{path}: expected targets.size_mm (edge of the tags) or a tags.csv with tag,size_mm, found none"
-        )
-    if (folder / "targets.csv").is_file():
-        return camera, load_targets(folder / "targets.csv", family, float(size) * MM, np.eye(4)), True
-    count = len(ids)
-    anywhere = Targets(
-        ids=ids,
-        centres=np.zeros((count, 3)),
-        normals=np.tile([0.0, 0, 1], (count, 1)),
-        x_axes=np.tile([1.0, 0, 0], (count, 1)),
-        size_m=float(size) * MM,
-        family=family,
-    )
-    return camera, anywhere, False
-
-
-def _tag_list(path: Path) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], float]:
-    """Return tag ids and their one size in mm of tags.csv."""
-    ids, sizes = [], set()
-    for where, row in csv_rows(path, ("tag", "size_mm")):
-        try:
-            tag, size = int(row["tag"]), float(row["size_mm"])
-        except ValueError:
-            raise InputError(f"{where}: expected a tag id and a size, found {list(row.values())}") from None
-        if tag < 0 or tag in ids or not (np.isfinite(size) and size > 0):
-            raise InputError(f"{where}: expected a new tag id and a positive size, found {tag}, {size}")
-        ids.append(tag)
-        sizes.add(size)
-    if len(sizes) != 1:
-        raise InputError(f"{path}: expected tags of one size, found {sorted(sizes)}")
-    return np.array(ids, dtype=np.int64), sizes.pop()
+    build = _on_nominal if known else _on_tags_alone
+    found = build(kept, kept_names, camera, targets, sigma_px)
+    rays = np.bincount(found.observations.point, minlength=len(found.points))
+    if (rays == 1).any():
+        # A point with one ray cannot be adjusted; photographs of a real part always show some tag only once.
+        once = named(found.point_names, rays == 1)
+        notes.append(f"{len(once)} point(s) are seen in one photograph only and are left out: {listed(once)}")
+        found = replace(found, observations=found.observations.select(rays[found.observations.point] > 1))
+    return PhotoSet(observations=found, notes=tuple(notes))
 
 
 def _sightings(measured: Sequence[Sequence[TagMeasurement]], camera: Camera, targets: Targets) -> list[TagSighting]:
@@ -257,13 +186,10 @@ def _on_tags_alone(
         _sightings(measured, camera, seen), seen.size_m, camera.intrinsics, names, [str(tag) for tag in ids]
     )
     points = transform(world_from_tag[:, None], square(seen.size_m)[None]).reshape(-1, 3)
-    observations = _observations(measured, seen, sigma_px)
-    once = np.bincount(observations.point, minlength=len(points)) < 2
-    if once.any():
-        # A tag that one image sees has known size but no second ray: it cannot be adjusted point by point.
-        observations = observations.select(~once[observations.point])
-    found = _set(names, seen, camera, poses, points, observations)
-    adjusted = estimate(_problem(found), robust=True)
+    found = _set(names, seen, camera, poses, points, _observations(measured, seen, sigma_px))
+    rays = np.bincount(found.observations.point, minlength=len(points))
+    twice = found.observations.select(rays[found.observations.point] > 1)
+    adjusted = estimate(_problem(replace(found, observations=twice)), robust=True)
     points = np.where(adjusted.used[:, None], adjusted.points, points)
     scale = seen.size_m / _mean_edge(points, adjusted.used)
     poses = adjusted.world_from_cam.copy()

@@ -16,7 +16,7 @@ from netdesign.model.arrays import Bools, Floats
 PIVOT = 1e-12  # of the scaled normal matrix with unit diagonal: below it the network is not determined
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
 def total_trace(
     world_from_cam: Floats, points: Floats, intrinsics: Floats, visible: Bools, sigma_px: Floats, basis: Floats
 ) -> float:

@@ -1,7 +1,8 @@
 """An image set, photographs of a tagged part, made into an observation set.
 
-What the folder holds is told in ``files/photo_folder.py``. With targets.csv the nominal coordinates are the approximate values and the world frame. Without, the world is the frame
-of the tag seen most often, and the mean edge of the tags gives the scale.
+What the folder holds is told in ``files/photo_folder.py``. With targets.csv the nominal coordinates are the approximate
+values and the world frame. Without, the world is the frame of the tag seen most often, and the mean edge of the tags
+gives the scale.
 """
 
 from collections.abc import Sequence

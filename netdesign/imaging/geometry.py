@@ -171,4 +171,5 @@ def face_levels(part: Part, look: Appearance) -> Floats:
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     light = np.asarray(look.light) / np.linalg.norm(look.light)
-    return np.asarray(look.face - look.relief * 0.5 * (1 - normals @ light))
+    mottle = look.mottle * np.random.default_rng(len(part.faces)).uniform(-1, 1, len(part.faces))
+    return np.asarray(np.clip(look.face - look.relief * 0.5 * (1 - normals @ light) + mottle, 0.0, 1.0))

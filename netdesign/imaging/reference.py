@@ -113,14 +113,19 @@ class ReferenceRenderer:
         return decimate(light, camera.blur_px, SUBPIXELS, 0, camera.height_px)
 
     def _draw_part(self, cam_from_world: Floats, light: Picture, inverse_depth: Picture) -> None:
+        bent, level = self._part_faces(cam_from_world)
+        xyz = np.concatenate([self._subpixels(bent) - 0.5, 1 / bent[..., 2:]], axis=-1)
+        _draw_triangles(xyz, level, light, inverse_depth)
+
+    def _part_faces(self, cam_from_world: Floats) -> tuple[Floats, Floats]:
+        """Return (t, 3, 3) faces in the camera frame, recessed, distorted, fine enough for it; and their levels."""
         part, camera = self.scene.part, self.camera
         triangles, face = part.triangles, np.arange(len(part.faces))
         if camera.distortion.any():
             distance = np.linalg.norm(transform(cam_from_world, part.vertices), axis=1).min()
             triangles, face = divided(part, FACE_STEP_PX * max(float(distance), 0.05) / float(camera.focal_px.max()))
         bent, usable = part_triangles(triangles, camera, cam_from_world, nearest=1e-3)
-        xyz = np.concatenate([self._subpixels(bent[usable]) - 0.5, 1 / bent[usable][..., 2:]], axis=-1)
-        _draw_triangles(xyz, self._level[face[usable]], light, inverse_depth)
+        return bent[usable], self._level[face[usable]]
 
     def _draw_tag(self, tag: int, cam_from_world: Floats, light: Picture, inverse_depth: Picture) -> None:
         targets, look = self.scene.targets, self.appearance
@@ -178,8 +183,7 @@ class ReferenceRenderer:
         camera, targets = self.camera, self.scene.targets
         inverse_depth = np.zeros((camera.height_px, camera.width_px), np.float32)
         tags = np.zeros((camera.height_px, camera.width_px), np.float32)
-        bent, usable = part_triangles(self.scene.part.triangles, camera, cam_from_world, nearest=1e-3)
-        shapes = [(bent[usable], 0.0)] + [
+        shapes = [(self._part_faces(cam_from_world)[0], 0.0)] + [
             (quad.vertices[quad.faces], float(targets.ids[quad.tag] + 1))
             for quad in tag_quads(targets, camera, cam_from_world)
         ]

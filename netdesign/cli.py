@@ -55,7 +55,7 @@ def run(
 @app.command()
 def new(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder to create", show_default=False)],
-    template: Annotated[str, typer.Option(help="starter to copy: polyhedron, plate or bracket")] = "polyhedron",
+    template: Annotated[str, typer.Option(help="shipped study to copy, a name of datasets/studies")] = "quick",
 ) -> None:
     """Write a starter study that runs as it is."""
     from netdesign.starter import write_starter
@@ -162,7 +162,7 @@ def dataset(
     renderer: RendererOption = "pyrender",
 ) -> None:
     """Write a free-standing synthetic image set from a recipe."""
-    from netdesign.imageset import render_dataset
+    from netdesign.dataset import render_dataset
 
     with _progress() as progress:
         count = render_dataset(recipe, output, workers=_workers(workers), renderer=renderer, progress=progress)

@@ -134,7 +134,7 @@ def load_task(path: Path, seed: int | None = None) -> Task:
     return Task(
         study=resolved.study,
         scene=Scene(part=part, targets=targets),
-        camera=_camera(study.camera, path),
+        camera=camera_of_table(study.camera, path),
         sphere=sphere,
         limits=_limits(study.visibility),
         cell=None if study.robot is None else resolve_cell(study.robot, path.parent),
@@ -156,7 +156,8 @@ def _targets(study: Study, path: Path, part: Part, world_from_mesh: Floats) -> T
     return spread_targets(part, table.family, size, table.spacing_mm * MM)
 
 
-def _camera(table: CameraTable, path: Path) -> Camera:
+def camera_of_table(table: CameraTable, path: Path) -> Camera:
+    """Return the camera of a [camera] table; ``path`` is the file that holds it."""
     noise = None
     if table.noise == "detector":
         noise = read_corner_noise(None if table.noise_file is None else _beside(path, table.noise_file))

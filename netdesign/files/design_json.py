@@ -59,9 +59,7 @@ def write_design(path: Path, task: Task, design: Design) -> None:
         "history": {"evaluations": design.history.evaluations, "hypervolume": design.history.hypervolume},
         "bounds": [{"images": size, "f1_mm2": bound / MM**2} for size, bound in sorted(design.bounds.items())],
         "notes": list(design.notes),
-        "networks": [
-            _network(number, network, (f1_scale, f2_scale)) for number, network in enumerate(design.networks)
-        ],
+        "networks": [_network(number, network, (f1_scale, f2_scale)) for number, network in enumerate(design.networks)],
     }
     write_json(path, "design", payload, task.sha256)
 

@@ -9,14 +9,17 @@ from netdesign.choose import choose, poses_of, read_design
 from netdesign.errors import InfeasibleError
 from netdesign.files.store import read_json, write_bytes, write_text
 from netdesign.files.study_text import study_toml
+from netdesign.model.arrays import Bools, Floats
 from netdesign.model.task import Task
 from netdesign.motion.robot import load_chain
+from netdesign.photogrammetry.limited_error import limited_covariance
+from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_error import DATUM
 from netdesign.photogrammetry.visibility import Sight
 from netdesign.placement.distances import network_total_error
 from netdesign.reporting import statics
 from netdesign.reporting.arm import Arm
-from netdesign.reporting.mesh import feature_edges, light_mesh
+from netdesign.reporting.mesh import PartMesh
 from netdesign.reporting.pages import Pictures, page
 from netdesign.reporting.record import NetworkRecord, RunRecord
 from netdesign.reporting.statics import Raster, thumbnail
@@ -37,8 +40,7 @@ def write_report(run: Path) -> Path:
         InputError: ``run`` is not a run directory with a design, or a file in it is damaged.
     """
     record = read_run(run)
-    vertices, faces = light_mesh(record.task.scene.part, TRIANGLES)
-    mesh = vertices, faces, feature_edges(vertices, faces)
+    mesh = PartMesh.of(record.task.scene.part, TRIANGLES)
     front = Raster.of(statics.front_figure(record), PAPER_DPI)
     write_bytes(run / "figures" / "front.png", front.png())
     networks = {}
@@ -98,6 +100,7 @@ def _network(run: Path, task: Task, sight: Sight, entry: dict[str, Any]) -> Netw
         visible_tags=seen.visible_tags,
         limited=total.limited,
         total=total.covariance,
+        without=_without(task, poses, seen.visible),
         datum=DATUM,
         determined=total.determined,
         diagnosis=total.diagnosis,
@@ -108,6 +111,19 @@ def _network(run: Path, task: Task, sight: Sight, entry: dict[str, Any]) -> Netw
         thumbnails=_thumbnails(folder),
         adjustment=_optional(folder / "adjustment.json", "adjustment"),
     )
+
+
+def _without(task: Task, poses: Floats, visible: Bools) -> Floats:
+    """Return (n,) the rms sigma in m, limited error propagation, of a network that loses one of its images."""
+    points, intrinsics = task.scene.targets.points, task.camera.intrinsics
+    sigma = sighting_sigma(task.camera, poses, task.scene.targets)
+    found = []
+    for image in range(len(poses)):
+        seen = visible.copy()
+        seen[image] = False
+        covariance = limited_covariance(poses, points, intrinsics, seen, sigma)
+        found.append(np.sqrt(np.trace(covariance, axis1=1, axis2=2).sum() / (3 * len(points))))
+    return np.array(found)
 
 
 def _thumbnails(folder: Path) -> tuple[tuple[str, bytes], ...]:

@@ -162,6 +162,13 @@ def test_feature_edges_of_a_box_are_its_twelve_edges():
     assert sorted(np.round(lengths, 9)) == sorted([0.24, 0.20, 0.16] * 4)
 
 
+def test_what_stands_behind_the_part_is_hidden():
+    part = mesh.PartMesh.of(box_part(), 100)
+    eye = np.array([0.0, 0.0, 1.0])
+    points = np.array([[0, 0, 0.08], [0, 0, -0.08], [0.11, 0.09, -0.2], [0.13, 0, -0.2], [0, 0, 0.3]])
+    assert mesh.hidden(part.tree, points, eye).tolist() == [False, True, True, False, False]
+
+
 def test_a_light_mesh_keeps_within_its_limit_and_near_the_surface():
     steps = np.linspace(0, 2 * np.pi, 81)[:-1]
     heights = np.linspace(-1, 1, 60)
@@ -225,6 +232,12 @@ def test_a_gridded_box_is_closed_and_faces_outwards():
     assert np.isclose(np.linalg.det(corners).sum() / 6, 0.03)
     assert np.isclose(0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
                                            axis=1).sum(), 2 * (0.06 + 0.15 + 0.1))  # fmt: skip
+
+
+def test_no_image_can_be_lost_for_free(proved):
+    for network in read_run(proved[0]).networks:
+        assert len(network.without) == network.images
+        assert (network.without >= 1e-6 * network.rms_um * (1 - 1e-12)).all()
 
 
 def test_a_design_that_assumed_another_noise_is_flagged(proved):

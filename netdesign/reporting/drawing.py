@@ -14,7 +14,10 @@ from matplotlib.collections import EllipseCollection, LineCollection, PolyCollec
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.frames import transform
-from netdesign.reporting.mesh import face_normals
+from netdesign.photogrammetry.bvh import TriangleTree
+from netdesign.reporting.mesh import PartMesh, face_normals, hidden
+
+EDGE_PIECES, TAG_PIECES = 8, 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,34 +57,43 @@ def draw_solids(axes: Axes, view: View, solids: Sequence[tuple[Floats, Ints, tup
     )
 
 
-def draw_part(axes: Axes, view: View, vertices: Floats, faces: Ints, edges: Ints) -> None:
-    """Draw the triangles that face the eye, shaded, from back to front, and the feature edges on faces in front."""
-    normals = face_normals(vertices, faces)
-    facing = normals @ view.axes[2]
-    front = facing > 1e-6
-    order = np.argsort(view.nearness(vertices[faces].mean(axis=1))[front], kind="stable")
+def draw_part(axes: Axes, view: View, part: PartMesh) -> None:
+    """Draw the triangles that face the eye, shaded, from back to front, and the feature edges that can be seen."""
+    normals = face_normals(part.vertices, part.faces)
+    front = normals @ view.axes[2] > 1e-6
+    triangles = part.vertices[part.faces[front]]
+    order = np.argsort(view.nearness(triangles.mean(axis=1)), kind="stable")
     light = view.axes.T @ np.array([-0.35, 0.55, 0.76])
     shade = 0.80 + 0.16 * np.clip(normals[front][order] @ light, 0, 1)
     colors = np.stack([shade, shade * 0.995, shade * 0.98, np.ones_like(shade)], axis=1)
     axes.add_collection(
-        PolyCollection(
-            list(view.flat(vertices[faces[front][order]])), facecolors=colors, edgecolors=colors, linewidths=0.4
-        )
+        PolyCollection(list(view.flat(triangles[order])), facecolors=colors, edgecolors=colors, linewidths=0.4)
     )
-    touched = np.zeros(len(vertices), dtype=bool)
-    touched[faces[front].ravel()] = True
-    visible = touched[edges].all(axis=1)
-    axes.add_collection(LineCollection(list(view.flat(vertices[edges[visible]])), colors="#8a8a85", linewidths=0.6))
-
-
-def draw_tags(axes: Axes, view: View, corners: Floats, normals: Floats, colors: Floats) -> None:
-    """Draw tags as quadrilaterals: corners (g, 4, 3), normals (g, 3), colors (g, 4), those that face the eye."""
-    front = normals @ view.axes[2] > 0.02
-    order = np.argsort(view.nearness(corners.mean(axis=1))[front], kind="stable")
+    # An edge may be seen in part: a few pieces of it are judged one by one.
+    ticks = np.linspace(0.0, 1.0, EDGE_PIECES + 1)[:, None]
+    start, end = part.vertices[part.edges[:, 0], None], part.vertices[part.edges[:, 1], None]
+    knots = start + ticks * (end - start)
+    pieces = np.stack([knots[:, :-1], knots[:, 1:]], axis=2).reshape(-1, 2, 3)
+    seen = ~hidden(part.tree, pieces.mean(axis=1), view.axes[2])
     axes.add_collection(
-        PolyCollection(list(view.flat(corners[front][order])), facecolors=colors[front][order], edgecolors="#33333355",
-                       linewidths=0.3)
-    )  # fmt: skip
+        LineCollection(list(view.flat(pieces[seen])), colors="#8a8a85", linewidths=0.6, capstyle="round")
+    )
+
+
+def draw_tags(axes: Axes, view: View, tree: TriangleTree, corners: Floats, normals: Floats, color: str) -> None:
+    """Draw tags, corners (g, 4, 3) and normals (g, 3), as far as they face the eye and nothing hides them."""
+    front = corners[normals @ view.axes[2] > 0.02]
+    ticks = np.linspace(0.0, 1.0, TAG_PIECES + 1)
+    u, v = (grid[..., None] for grid in np.meshgrid(ticks, ticks, indexing="ij"))
+    a, b, c, d = (front[:, None, None, corner] for corner in range(4))
+    knots = (1 - u) * ((1 - v) * a + v * d) + u * ((1 - v) * b + v * c)
+    cells = np.stack([knots[:, :-1, :-1], knots[:, 1:, :-1], knots[:, 1:, 1:], knots[:, :-1, 1:]], axis=3)
+    cells = cells.reshape(-1, 4, 3)
+    seen = ~hidden(tree, cells.mean(axis=1), view.axes[2])
+    # Not antialiased: neighbouring pieces would show their seams.
+    axes.add_collection(
+        PolyCollection(list(view.flat(cells[seen])), facecolors=[color], linewidths=0, antialiased=False)
+    )
 
 
 def frustum_lines(camera: Camera, world_from_cam: Floats, depth: float) -> Floats:

@@ -1,9 +1,47 @@
 """The part as a report draws it: few enough triangles, and the edges that the eye looks for."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from netdesign.model.arrays import Floats, Ints
+from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.scene import Part
+from netdesign.photogrammetry.bvh import TriangleTree
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartMesh:
+    """The part, ready to be drawn.
+
+    Attributes:
+        vertices: (v, 3) m.  faces: (t, 3).  edges: (e, 2) feature edges.  tree: over the same triangles.
+    """
+
+    vertices: Floats
+    faces: Ints
+    edges: Ints
+    tree: TriangleTree
+
+    @classmethod
+    def of(cls, part: Part, limit: int) -> "PartMesh":
+        """Return the part with at most ``limit`` triangles."""
+        vertices, faces = light_mesh(part, limit)
+        return cls(
+            vertices=vertices,
+            faces=faces,
+            edges=feature_edges(vertices, faces),
+            tree=TriangleTree.build(vertices[faces]),
+        )
+
+
+def hidden(tree: TriangleTree, points: Floats, towards: Floats) -> Bools:
+    """Return (k,) whether a triangle stands between points (k, 3) and an eye far away in direction ``towards`` (3,).
+
+    The points start a five-hundredth of the scene's size nearer to the eye, off the surface they lie on.
+    """
+    size = float(np.linalg.norm(tree.bounds[1, 3:] - tree.bounds[1, :3]))
+    origins = points + 0.002 * size * towards
+    return tree.blocked(origins, origins + 10.0 * size * towards)
 
 
 def light_mesh(part: Part, limit: int) -> tuple[Floats, Ints]:

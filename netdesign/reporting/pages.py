@@ -1,6 +1,5 @@
 """The page: everything it shows as plain values for the template, and the template filled in."""
 
-import base64
 import importlib.resources
 from dataclasses import dataclass
 from typing import Any
@@ -11,11 +10,11 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from netdesign import __version__
-from netdesign.model.task import Task
 from netdesign.reporting import charts, palette, proof, words
+from netdesign.reporting.articles import article, uri
+from netdesign.reporting.mesh import PartMesh
 from netdesign.reporting.payload import as_script, payload
-from netdesign.reporting.record import NetworkRecord, RunRecord
-from netdesign.reporting.statics import MESH, exaggeration
+from netdesign.reporting.record import RunRecord
 
 Values = dict[str, Any]
 
@@ -30,7 +29,7 @@ class Pictures:
     achieved: bytes | None
 
 
-def page(record: RunRecord, mesh: MESH, pictures: Pictures, study_text: str) -> str:
+def page(record: RunRecord, mesh: PartMesh, pictures: Pictures, study_text: str) -> str:
     """Return the whole report as one HTML document that loads nothing."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("netdesign", "reporting/templates"),
@@ -63,13 +62,13 @@ def page(record: RunRecord, mesh: MESH, pictures: Pictures, study_text: str) -> 
         tiles=_tiles(record),
         captions=_captions(record),
         images={
-            "front": _uri("webp", pictures.front),
-            "achieved": _uri("webp", pictures.achieved) if pictures.achieved else "",
+            "front": uri("webp", pictures.front),
+            "achieved": uri("webp", pictures.achieved) if pictures.achieved else "",
         },
-        cell={"uri": _uri("webp", pictures.cell) if pictures.cell else "", "caption": _cell_caption(record)},
+        cell={"uri": uri("webp", pictures.cell) if pictures.cell else "", "caption": _cell_caption(record)},
         columns=_columns(record),
         rows=_rows(record),
-        networks=[_article(record, network, pictures.networks[network.id]) for network in record.networks],
+        networks=[article(record, network, pictures.networks[network.id]) for network in record.networks],
         point_count=len(record.task.scene.targets.points),
         campaign=proof.campaign(record),
         flags=words.all_flags(record),
@@ -78,10 +77,6 @@ def page(record: RunRecord, mesh: MESH, pictures: Pictures, study_text: str) -> 
         study_text=study_text,
         glossary=words.GLOSSARY,
     )
-
-
-def _uri(kind: str, content: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def _cell_caption(record: RunRecord) -> str:
@@ -179,68 +174,6 @@ def _rows(record: RunRecord) -> list[Values]:
         default = {"left": False, "color": "", "chip": "", "mark": ""}
         rows.append({"id": network.id, "cells": [{**default, **cell} for cell in cells]})
     return rows
-
-
-def _article(record: RunRecord, network: NetworkRecord, picture: bytes) -> Values:
-    factor = exaggeration(record, network.total)
-    chips = [{"kind": words.chip_kind(network.verdict), "text": network.verdict}]
-    if network.id == record.knee:
-        chips.insert(0, {"kind": "key", "text": "recommended"})
-    unit = record.tour_unit
-    ratio = network.bound_ratio
-    numbers = [
-        {"name": "images", "value": str(network.images)},
-        {"name": "tour", "value": f"{network.tour:.4g} {unit}"},
-        {"name": "rms σ total", "value": f"{words.finite(network.total_rms_um)} µm"},
-        {"name": "largest σ total", "value": f"{words.finite(network.total_max_um)} µm"},
-        {"name": "rms σ limited", "value": f"{words.finite(network.rms_um)} µm"},
-        {"name": "bound ratio", "value": "–" if ratio is None else f"{ratio:.3f}"},
-        {"name": "rays, least and mean", "value": f"{network.rays.min()} · {network.rays.mean():.1f}"},
-        *proof.adjustment_numbers(network),
-    ]
-    return {
-        "id": network.id,
-        "name": network.name,
-        "chips": chips,
-        "numbers": numbers,
-        "flags": words.network_flags(network),
-        "picture": _uri("webp", picture),
-        "ellipsoid_caption": words.ellipsoid_words(factor, words.SHORT_DATUM),
-        "bars": charts.dot_chart(proof.bars(network), "µm"),
-        "bars_caption": "Rms sigma per coordinate over all object points.",
-        "proof": proof.network_proof(network),
-        "thumbnails": [{"name": name, "uri": _uri("jpeg", content)} for name, content in network.thumbnails],
-        "tour": _tour(record, network),
-        "datum_note": f"Limited: {words.LIMITED_DATUM}. Total: datum {network.datum}.",
-    }
-
-
-def _tour(record: RunRecord, network: NetworkRecord) -> Values:
-    """Return the run sheet: stations in visiting order with the leg that leads there, in the metric of f2."""
-    joints = network.planned.get("joints_rad")
-    degrees = None if joints is None else np.degrees(np.array(joints))
-    legs = _legs(record.task, network)
-    columns = ["station", "azimuth α", "elevation β", "x mm", "y mm", "z mm", "points seen", f"leg [{legs[1]}]"]
-    if degrees is not None:
-        columns += [f"q{index}°" for index in range(1, degrees.shape[1] + 1)]
-    rows = []
-    for index, (alpha, beta) in enumerate(network.planned["viewpoints_deg"]):
-        position = network.world_from_cam[index, :3, 3] * 1e3
-        row = [str(index + 1), f"{alpha:.1f}°", f"{beta:.1f}°", *(f"{value:.1f}" for value in position)]
-        row += [str(4 * int(network.visible_tags[index].sum())), "" if index == 0 else f"{legs[0][index - 1]:.3g}"]
-        row += [] if degrees is None else [f"{value:.1f}" for value in degrees[index]]
-        rows.append(row)
-    return {"columns": columns, "rows": rows}
-
-
-def _legs(task: Task, network: NetworkRecord) -> tuple[list[float], str]:
-    """Return (n - 1 leg lengths, unit): weighted joint space for the joint objective, else millimetres."""
-    joints = network.planned.get("joints_rad")
-    if task.study.motion == "joint" and joints is not None:
-        robot = task.study.robot
-        weights = np.ones(len(joints[0])) if robot is None or robot.joint_weights is None else robot.joint_weights
-        return np.linalg.norm(np.diff(np.array(joints), axis=0) * weights, axis=1).tolist(), "rad"
-    return (np.linalg.norm(np.diff(network.world_from_cam[:, :3, 3], axis=0), axis=1) * 1e3).tolist(), "mm"
 
 
 def _history(record: RunRecord) -> Markup:

@@ -9,17 +9,17 @@ from netdesign.model.arrays import Floats
 from netdesign.model.task import Task
 from netdesign.reporting import palette
 from netdesign.reporting.arm import Arm
+from netdesign.reporting.mesh import PartMesh
 from netdesign.reporting.proof import scatter
 from netdesign.reporting.record import NetworkRecord, RunRecord
-from netdesign.reporting.statics import MESH, exaggeration
+from netdesign.reporting.statics import exaggeration
 
 MM, UM2 = 1e3, 1e12
 UPPER = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))  # rows and columns of xx, xy, xz, yy, yz, zz
 
 
-def payload(record: RunRecord, mesh: MESH) -> dict[str, Any]:
+def payload(record: RunRecord, mesh: PartMesh) -> dict[str, Any]:
     """Return the data of the page; lengths in mm, sigmas in µm, covariances in µm² as xx, xy, xz, yy, yz, zz."""
-    vertices, faces, edges = mesh
     task = record.task
     camera, sphere = task.camera, task.sphere
     width, height = camera.width_px - 0.5, camera.height_px - 0.5
@@ -30,7 +30,11 @@ def payload(record: RunRecord, mesh: MESH) -> dict[str, Any]:
         "tourUnit": record.tour_unit,
         "knee": record.knee,
         "bounds": [[size, significant(value, 5)] for size, value in record.bounds_um()],
-        "part": {"v": decimals(vertices * MM, 2), "f": faces.ravel().tolist(), "e": edges.ravel().tolist()},
+        "part": {
+            "v": decimals(mesh.vertices * MM, 2),
+            "f": mesh.faces.ravel().tolist(),
+            "e": mesh.edges.ravel().tolist(),
+        },
         "tags": decimals(_raised(task) * MM, 3),
         "points": decimals(task.scene.targets.points * MM, 3),
         "pointIds": list(task.scene.targets.point_ids),

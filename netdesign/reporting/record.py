@@ -22,6 +22,7 @@ class NetworkRecord:
         world_from_cam: (n, 4, 4) m, in visiting order.
         visible_tags: (n, g) which image sees which tag, from exact rays.
         limited, total: (m, 3, 3) m², recomputed for the report from the poses; inf where undetermined.
+        without: (n,) rms sigma in m, limited, if one image were lost; inf when a point is then undetermined.
         datum: of ``total``.  determined: the rank test of the total propagation.  diagnosis: what it complains about.
         validation, adjustment: contents of the network's files; None when they do not exist.
         repeats: validations of further realisations of the same network.
@@ -33,6 +34,7 @@ class NetworkRecord:
     visible_tags: Bools
     limited: Floats
     total: Floats
+    without: Floats
     datum: str
     determined: bool
     diagnosis: tuple[str, ...]

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from netdesign.errors import InputError
-from netdesign.model.arrays import Floats, Ints
+from netdesign.model.arrays import Floats
+from netdesign.photogrammetry.bvh import TriangleTree
 from netdesign.reporting import palette
 from netdesign.reporting.arm import box_mesh
 from netdesign.reporting.drawing import View, draw_ellipsoids, draw_part, draw_solids, draw_tags, frustum_lines
+from netdesign.reporting.mesh import PartMesh, hidden
 from netdesign.reporting.proof import scatter
 from netdesign.reporting.record import NetworkRecord, RunRecord
 
@@ -32,7 +34,7 @@ STYLE: Any = {
 }  # fmt: skip
 EYE = View(azimuth=np.radians(-52.0), elevation=np.radians(28.0))
 CELL_EYE = View(azimuth=np.radians(-62.0), elevation=np.radians(24.0))
-MESH = tuple[Floats, Ints, Ints]  # vertices, faces, feature edges
+DARK_TAG, PALE_TAG = "#3a3c40", "#b9b8b4"  # opaque: tags are drawn in pieces that overlap at their seams
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +136,7 @@ def front_figure(record: RunRecord) -> Figure:
     return figure
 
 
-def network_figure(record: RunRecord, network: NetworkRecord, mesh: MESH) -> Figure:
+def network_figure(record: RunRecord, network: NetworkRecord, mesh: PartMesh) -> Figure:
     """Return one network: its stations and tour around the part, and the uncertainty of the object points."""
     with rc_context(STYLE):
         figure = Figure(figsize=(9.6, 4.5))
@@ -174,23 +176,29 @@ def achieved_figure(record: RunRecord) -> Figure | None:
     return figure
 
 
-def cell_figure(record: RunRecord, mesh: MESH) -> Figure | None:
+def cell_figure(record: RunRecord, mesh: PartMesh) -> Figure | None:
     """Return the robot at the first station of the recommended network; None without a robot."""
     network = next(network for network in record.networks if network.id == record.knee)
     joints = network.planned.get("joints_rad")
     if record.arm is None or joints is None:
         return None
     poses, arm = network.world_from_cam, record.arm
-    solids = [(*box_mesh(centre, size, steps=24), (0.78, 0.76, 0.72)) for centre, size in arm.obstacles]
-    solids += [(mesh[0], mesh[1], (0.93, 0.92, 0.89))]
-    solids += [(vertices, faces, (0.62, 0.70, 0.76)) for vertices, faces in arm.posed(np.array(joints[0]))]
+    table = [(*box_mesh(centre, size, steps=24), (0.78, 0.76, 0.72)) for centre, size in arm.obstacles]
+    part = [(mesh.vertices, mesh.faces, (0.93, 0.92, 0.89))]
+    body = [(vertices, faces, (0.62, 0.70, 0.76)) for vertices, faces in arm.posed(np.array(joints[0]))]
+    # The painter's order of large triangles errs where things stand on one another: what stands below comes first.
+    hand = CELL_EYE.nearness(np.concatenate([vertices for vertices, _, _ in body[-2:]])).mean()
+    groups = [table, part, body] if hand > CELL_EYE.nearness(mesh.vertices).mean() else [table, body, part]
     with rc_context(STYLE):
         figure = Figure(figsize=(9.6, 6.0))
         axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
-        draw_solids(axes, CELL_EYE, solids)
+        for group in groups:
+            draw_solids(axes, CELL_EYE, group)
         targets = record.task.scene.targets
-        tag_colors = np.tile([0.17, 0.18, 0.2, 0.9], (len(targets.ids), 1))
-        draw_tags(axes, CELL_EYE, targets.points.reshape(-1, 4, 3), np.asarray(targets.normals), tag_colors)
+        everything = TriangleTree.build(
+            np.concatenate([vertices[faces] for group in groups for vertices, faces, _ in group])
+        )
+        draw_tags(axes, CELL_EYE, everything, targets.points.reshape(-1, 4, 3), np.asarray(targets.normals), DARK_TAG)
         frusta = frustum_lines(record.task.camera, poses, 0.12 * record.task.sphere.radius)
         first = frustum_lines(record.task.camera, poses[:1], 0.8 * record.task.sphere.radius)
         for lines, color, width in ((frusta, palette.PREDICTED_TOTAL, 0.7), (first, palette.ACHIEVED, 0.9)):
@@ -215,7 +223,7 @@ def exaggeration(record: RunRecord, covariance: Floats) -> float:
     return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= wanted * (1 + 1e-9)))
 
 
-def _stations(axes: Axes, record: RunRecord, network: NetworkRecord, mesh: MESH) -> None:
+def _stations(axes: Axes, record: RunRecord, network: NetworkRecord, mesh: PartMesh) -> None:
     targets, camera = record.task.scene.targets, record.task.camera
     centres = network.world_from_cam[:, :3, 3]
     frusta = frustum_lines(camera, network.world_from_cam, 0.16 * record.task.sphere.radius)
@@ -224,9 +232,8 @@ def _stations(axes: Axes, record: RunRecord, network: NetworkRecord, mesh: MESH)
     axes.add_collection(
         LineCollection(list(EYE.flat(frusta[behind].reshape(-1, 2, 3))), colors=color + "66", linewidths=0.6)
     )
-    draw_part(axes, EYE, *mesh)
-    tag_colors = np.tile([0.17, 0.18, 0.2, 0.8], (len(targets.ids), 1))
-    draw_tags(axes, EYE, targets.points.reshape(-1, 4, 3), np.asarray(targets.normals), tag_colors)
+    draw_part(axes, EYE, mesh)
+    draw_tags(axes, EYE, mesh.tree, targets.points.reshape(-1, 4, 3), np.asarray(targets.normals), DARK_TAG)
     axes.add_collection(LineCollection(list(EYE.flat(frusta[~behind].reshape(-1, 2, 3))), colors=color, linewidths=0.7))
     flat = EYE.flat(centres)
     axes.plot(*flat.T, color=palette.TOUR, linewidth=1.3, zorder=3)
@@ -236,15 +243,15 @@ def _stations(axes: Axes, record: RunRecord, network: NetworkRecord, mesh: MESH)
     _frame(axes)
 
 
-def _ellipsoids(axes: Axes, record: RunRecord, network: NetworkRecord, mesh: MESH) -> float:
+def _ellipsoids(axes: Axes, record: RunRecord, network: NetworkRecord, mesh: PartMesh) -> float:
     targets = record.task.scene.targets
     points, normals = targets.points, targets.point_normals
     factor = exaggeration(record, network.total)
-    draw_part(axes, EYE, *mesh)
+    draw_part(axes, EYE, mesh)
     finite = np.isfinite(network.total).all(axis=(1, 2))
     front = (normals @ EYE.axes[2] > 0.02) & finite
-    grey = np.tile([0.17, 0.18, 0.2, 0.28], (len(targets.ids), 1))
-    draw_tags(axes, EYE, points.reshape(-1, 4, 3), np.asarray(targets.normals), grey)
+    front[front] = ~hidden(mesh.tree, points[front], EYE.axes[2])
+    draw_tags(axes, EYE, mesh.tree, points.reshape(-1, 4, 3), np.asarray(targets.normals), PALE_TAG)
     draw_ellipsoids(axes, EYE, points, network.total, factor, palette.PREDICTED_TOTAL, front)
     _frame(axes)
     if not finite.any():

@@ -43,6 +43,11 @@ GLOSSARY = (
         "The network farthest, in logarithms scaled to the front, on the good side of the plane through the three "
         "best-in-one-thing corners: more precision costs much from here on, less saves little.",
     ),
+    (
+        "Without it",
+        "What the rms sigma (limited propagation) would become if that one image were lost, and how many object points "
+        "would be left with too few rays: the stations not to lose.",
+    ),
     ("Tour", "The open path through all stations in visiting order; its length is objective f2."),
     ("Rays", "Images that see an object point; with fewer than three a gross error cannot be found."),
     (

@@ -12,9 +12,9 @@ from netdesign.motion.joint_map import JointMap
 # 0.02 rad moves the tip of an outstretched UR10 by 26 mm: between two tests it stays within the margin of 20 mm.
 _STEP = 0.02
 _TURN = 2.0 * np.pi
-_ROADMAP = 200
+_ROADMAP = 150
 _NEIGHBOURS = 12
-_LAZY_ROUNDS = 600
+_LAZY_ROUNDS = 200
 _STOP = 0.1  # rad: what a via point costs on top of its way
 
 
@@ -42,11 +42,13 @@ class Legs:
     def detour(self, start: Floats, end: Floats) -> Floats | None:
         """Return via points (k, r) of a free way from start to end (r,), None when none is found.
 
-        A lazy roadmap: nodes are free joints of a coarse subset of the map, each in the turn nearest to the leg, joined
-        to their nearest; the shortest way is tested leg by leg, legs that collide are taken out, and so on. Legs must
-        be free for the capsules, which contain the meshes. Source: R. Bohlin, L. E. Kavraki, ICRA 2000 (lazy PRM).
+        A lazy roadmap: nodes are free joints of a coarse subset of the map, each in the turns nearest to the leg,
+        joined to their nearest; the shortest way is tested leg by leg, legs that collide are taken out, and so on.
+        Legs must be free for the capsules, which contain the meshes. Source: R. Bohlin, L. E. Kavraki, ICRA 2000.
         """
-        nodes = self._candidates(0.5 * (start + end))
+        nodes = np.unique(
+            np.concatenate([self._candidates(share * start + (1.0 - share) * end) for share in (0.0, 0.5, 1.0)]), axis=0
+        )
         way = np.linalg.norm(nodes - start, axis=1) + np.linalg.norm(nodes - end, axis=1)
         nodes = np.concatenate([[start, end], nodes[np.argsort(way, kind="stable")[:_ROADMAP]]])
         distance = np.linalg.norm(nodes[:, None] - nodes, axis=2)

@@ -66,19 +66,24 @@ def _free_on_meshes(arm: ArmCell, joints: Floats) -> Bools:
 
 
 def lifted(options: StationOptions, chosen: list[list[int]], lower: Floats, upper: Floats) -> StationOptions:
-    """Return the chosen options of every station in every turn of every joint inside the limits (r,)."""
+    """Return the chosen options of every station in every turn of every joint inside the limits (r,).
+
+    Their labels count branch and turns of the first three joints together: what a collision on a leg depends on.
+    """
     kept = []
+    numbers: dict[tuple[int, ...], int] = {}
     for station, indices in enumerate(chosen):
         copies: list[tuple[float, ...]] = []
         labels: list[int] = []
         for q, branch in zip(*options.keep(station, indices), strict=True):
+            values = q.tolist()
             turns = [
-                [value + turn * _TURN for turn in (0, -1, 1) if low <= value + turn * _TURN <= high]
-                for value, low, high in zip(q.tolist(), lower.tolist(), upper.tolist(), strict=True)
+                [turn for turn in (0, -1, 1) if low <= value + turn * _TURN <= high]
+                for value, low, high in zip(values, lower.tolist(), upper.tolist(), strict=True)
             ]
-            combinations = list(itertools.product(*turns))
-            copies += combinations
-            labels += [int(branch)] * len(combinations)
+            for combination in itertools.product(*turns):
+                copies.append(tuple(value + turn * _TURN for value, turn in zip(values, combination, strict=True)))
+                labels.append(numbers.setdefault((int(branch), *combination[:3]), len(numbers)))
         kept.append((np.array(copies), np.array(labels, dtype=np.int64)))
     return _packed(kept, options.joints.shape[1], ())
 

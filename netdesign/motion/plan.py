@@ -5,8 +5,8 @@
    problems are solved exactly (``exact_tour``).
 3. The best options of every station, in all turns inside the limits, take part in the same alternation without the
    modulo: what comes out can be driven.
-4. Every leg is tested; a colliding one is barred for its pair of branches and step 3 is repeated. Where that does not
-   help, via points are put in.
+4. Every leg is tested; a colliding one is barred for its pair of branches and turns, and step 3 is repeated. Where
+   that does not help, via points are put in.
 """
 
 from dataclasses import dataclass, field
@@ -100,13 +100,11 @@ def plan_on(joint_map: JointMap, viewpoints: Floats, motion: Literal["joint", "t
     if options.refused:
         return Plan(tour=None, world_from_cam=np.zeros((0, 4, 4)), viewpoints=np.zeros((0, 2)), refused=options.refused)
     arm, timed = joint_map.arm, motion == "time"
-    labels = int(options.label.max()) + 1
     free = np.zeros((0, 0, 0, 0))
     modulo = _Problem(options, law_of(arm), timed, free)
     starts = _starts(modulo, viewpoints, seed)
     legs = Legs(joint_map)
-    barred = np.zeros((len(viewpoints), len(viewpoints), labels, labels))
-    order, joints, notes = _repaired(modulo, starts, legs, barred, arm.placed.lower, arm.placed.upper)
+    order, joints, notes = _repaired(modulo, starts, legs, arm.placed.lower, arm.placed.upper)
     vias, more, refused = _vias(legs, joints, order)
     if refused:
         return Plan(tour=None, world_from_cam=np.zeros((0, 4, 4)), viewpoints=np.zeros((0, 2)), refused=refused)
@@ -201,12 +199,14 @@ def _best_through(problem: _Problem, tour: Ints) -> list[list[int]]:
 
 
 def _repaired(
-    modulo: _Problem, starts: list[tuple[float, Ints, Ints]], legs: Legs, barred: Floats, lower: Floats, upper: Floats
+    modulo: _Problem, starts: list[tuple[float, Ints, Ints]], legs: Legs, lower: Floats, upper: Floats
 ) -> tuple[Ints, Floats, tuple[str, ...]]:
     """Return (order (n,), joints (n, r) in that order, notes): lifted, colliding legs barred while that helps."""
     candidates = []
     for _, tour, _ in starts[:2]:
         options = lifted(modulo.options, _best_through(modulo, tour), lower, upper)
+        count, labels = len(options.count), int(options.label.max()) + 1
+        barred = np.zeros((count, count, labels, labels))
         problem = _Problem(options, _plain(modulo.law), modulo.timed, barred)
         candidates.append((problem.tour(tour), problem))
     (_, tour, _), problem = min(candidates, key=lambda item: item[0][0])
@@ -220,7 +220,7 @@ def _repaired(
             break
         for leg in colliding:
             i, j, a, b = order[leg], order[leg + 1], labels[leg], labels[leg + 1]
-            barred[i, j, a, b] = barred[j, i, b, a] = _BARRED
+            problem.barred[i, j, a, b] = problem.barred[j, i, b, a] = _BARRED
     notes = () if attempts == 0 else (f"tour re-planned {attempts} times around legs that collide",)
     return *best, notes
 

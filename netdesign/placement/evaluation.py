@@ -30,7 +30,8 @@ class SphereTables(NamedTuple):
         weight_grid: (6,) grid of the rows of ``weight``.
         variance: m² per unit of the moment form, sigma² / f².
         min_rays, min_tags: images per tag, tags per image.
-        criterion: MEAN_VARIANCE or MAX_SIGMA.  longest: admissible f2.
+        criterion: MEAN_VARIANCE or MAX_SIGMA.
+        in_joints: f2 comes from :func:`joint_tours`.  longest: admissible workspace f2.
         limits: (4,) lowest and highest azimuth, lowest and highest elevation, rad.
     """
 
@@ -46,17 +47,22 @@ class SphereTables(NamedTuple):
     min_rays: int
     min_tags: int
     criterion: int
+    in_joints: bool
     longest: float
     limits: Floats
 
 
 class JointTables(NamedTuple):
-    """What the joint-space tour looks up: arrays of the JointMap; law, timed and dwell (s) of ``motion.joint_tour``."""
+    """What the joint-space tour looks up: arrays of the JointMap; law, timed and dwell (s) of ``motion.joint_tour``.
+
+    longest: admissible f2.
+    """
 
     arrays: Any
     law: Floats
     timed: bool
     dwell: float
+    longest: float
 
 
 @njit(cache=True, error_model="numpy")
@@ -148,20 +154,38 @@ def precision_objective(variances: Floats, tables: SphereTables) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def motion_objective(viewpoints: Floats, directions: Floats, tables: SphereTables, joint: Any) -> tuple[float, int]:
-    """Return (f2, stations out of reach) of viewpoints (k, 2) with directions (k, 3); workspace when joint is None."""
-    if joint is None:
-        return tables.radius * path_length(directions), 0
-    else:
-        found: tuple[float, int] = network_tour(joint.arrays, joint.law, joint.timed, joint.dwell, viewpoints)
-        return found
+def excess(length: float, longest: float) -> float:
+    """Return how far a tour is beyond the longest admissible one, in [0, 1)."""
+    return max(0.0, 1.0 - longest / length) if length > 0.0 else 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def evaluate_networks(
-    bits: Bools, genes: Floats, tables: SphereTables, joint: Any, objectives: Floats, violation: Floats
-) -> None:
-    """Write objectives (P, 3) and violation (P,) of chromosomes: bits (P, n), genes (P, n, 2) = (alpha, beta) rad."""
+def joint_tours(bits: Bools, genes: Floats, joint: JointTables, objectives: Floats, violation: Floats) -> None:
+    """Replace f2 of the feasible rows by the joint-space tour and add the stations out of reach to their violation.
+
+    Apart from :func:`evaluate_networks`: compiled into it, the tour over joint options would take half as long again.
+    """
+    count, slots = bits.shape
+    viewpoints = np.zeros((slots, 2))
+    for p in range(count):
+        if violation[p] > 0:
+            continue
+        k = 0
+        for slot in range(slots):
+            if bits[p, slot]:
+                viewpoints[k, 0], viewpoints[k, 1] = genes[p, slot, 0], genes[p, slot, 1]
+                k += 1
+        length, refused = network_tour(joint.arrays, joint.law, joint.timed, joint.dwell, viewpoints[:k])
+        objectives[p, 1] = length
+        violation[p] = refused + excess(length, joint.longest)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def evaluate_networks(bits: Bools, genes: Floats, tables: SphereTables, objectives: Floats, violation: Floats) -> None:
+    """Write objectives (P, 3) and violation (P,) of chromosomes: bits (P, n), genes (P, n, 2) = (alpha, beta) rad.
+
+    f2 is the workspace tour, or left at 0 when ``tables.in_joints``: :func:`joint_tours` follows then.
+    """
     count, slots = bits.shape
     blocks = len(tables.points) // (3 * LANES)
     viewpoints, directions = np.zeros((slots, 2)), np.zeros((slots, 3))
@@ -186,6 +210,6 @@ def evaluate_networks(
             continue
         write_moments(viewpoints[:k], directions, cells, tables, weights, four, moments)
         weak = variances_from_moments(moments, tables.points, tables.radius, tables.point_count, variances)
-        length, refused = motion_objective(viewpoints[:k], directions[:k], tables, joint)
+        length = 0.0 if tables.in_joints else tables.radius * path_length(directions[:k])
         objectives[p, 0], objectives[p, 1] = precision_objective(variances, tables), length
-        violation[p] = weak + refused + max(0.0, 1.0 - tables.longest / length if length > 0.0 else 0.0)
+        violation[p] = weak + excess(length, tables.longest)

@@ -4,9 +4,11 @@ From a member of the archive, under one weighting of log f1 against log f2, sing
 other and kept when the weighted sum falls. f1 comes from the moments minus the old camera plus the new one; in the
 workspace f2 comes from taking the station out of the tour and putting it back where it costs least, repaired by 3-opt
 only when that brings the move within reach. Every network tried is written out, for the archive to judge.
+
+With motion in joints the workspace tour only guides the moves; f2 of what was tried is then computed in joints.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -16,8 +18,8 @@ from netdesign.motion.tour import _improve
 from netdesign.photogrammetry.limited_error import LANES, add_four_cameras, variances_from_moments
 from netdesign.placement.evaluation import (
     SphereTables,
+    excess,
     missing_sightings,
-    motion_objective,
     precision_objective,
     write_direction,
     write_moments,
@@ -100,7 +102,7 @@ def reinserted(D: Floats, t: Ints, count: int, gone: int, new: int, moved: Float
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def improve_networks(
-    viewpoints: Floats, sizes: Ints, tries: Tries, tables: SphereTables, joint: Any,
+    viewpoints: Floats, sizes: Ints, tries: Tries, tables: SphereTables,
     found: Floats, counts: Ints, objectives: Floats, violation: Floats,
 ) -> None:  # fmt: skip
     """Try what ``tries`` says on B feasible networks, improving them on the way; write every network tried.
@@ -129,14 +131,11 @@ def improve_networks(
         weights[:] = 0.0  # slots 2 and 3 stay empty from here on
         variances_from_moments(moments, tables.points, tables.radius, tables.point_count, variances)
         f1 = precision_objective(variances, tables)
-        if joint is None:
-            for i in range(k):
-                write_chords(now, k, i, D)
-            for x in range(k + 1):
-                t[x] = x
-            f2 = tables.radius * _improve(D, t[: k + 1], P)
-        else:
-            f2 = motion_objective(here[:k], now[:k], tables, joint)[0]
+        for i in range(k):
+            write_chords(now, k, i, D)
+        for x in range(k + 1):
+            t[x] = x
+        f2 = tables.radius * _improve(D, t[: k + 1], P)
         w = tries.preference[b]
         value = w * np.log(f1) + (1.0 - w) * np.log(f2 + 1e-9)
         for c in range(tries.kind.shape[1]):
@@ -179,26 +178,23 @@ def improve_networks(
             if weak > 0:
                 violation[b, c] = weak
                 continue
-            new_f1, refused = precision_objective(variances, tables), 0
-            if joint is None:
-                if kind == REMOVE:
-                    length = reinserted(D, t, k + 1, i + 1, -1, D[0], trial)
-                else:
-                    write_chords(then, size, i, trial_D)
-                    gone = i + 1 if kind == MOVE else -1
-                    length = reinserted(D, t, k + 1, gone, i + 1, trial_D[i + 1], trial)
-                new_f2 = tables.radius * length
-                near = w * np.log(new_f1) + (1.0 - w) * np.log(new_f2 + 1e-9) < value + PROMISING
-                if kind == MOVE and near:
-                    for x in range(1, k + 1):
-                        for y in range(1, k + 1):
-                            if x != i + 1 and y != i + 1:
-                                trial_D[x, y] = D[x, y]
-                    new_f2 = tables.radius * _improve(trial_D, trial[: k + 1], P)
+            new_f1 = precision_objective(variances, tables)
+            if kind == REMOVE:
+                length = reinserted(D, t, k + 1, i + 1, -1, D[0], trial)
             else:
-                new_f2, refused = motion_objective(there[:size], then[:size], tables, joint)
+                write_chords(then, size, i, trial_D)
+                gone = i + 1 if kind == MOVE else -1
+                length = reinserted(D, t, k + 1, gone, i + 1, trial_D[i + 1], trial)
+            new_f2 = tables.radius * length
+            near = w * np.log(new_f1) + (1.0 - w) * np.log(new_f2 + 1e-9) < value + PROMISING
+            if kind == MOVE and near:
+                for x in range(1, k + 1):
+                    for y in range(1, k + 1):
+                        if x != i + 1 and y != i + 1:
+                            trial_D[x, y] = D[x, y]
+                new_f2 = tables.radius * _improve(trial_D, trial[: k + 1], P)
             objectives[b, c, 0], objectives[b, c, 1] = new_f1, new_f2
-            violation[b, c] = refused + max(0.0, 1.0 - tables.longest / new_f2 if new_f2 > 0.0 else 0.0)
+            violation[b, c] = excess(new_f2, tables.longest)
             new_value = w * np.log(new_f1) + (1.0 - w) * np.log(new_f2 + 1e-9)
             if kind != MOVE or violation[b, c] > 0 or new_value >= value:
                 continue
@@ -207,7 +203,6 @@ def improve_networks(
             now[i, 0], now[i, 1], now[i, 2] = then[i, 0], then[i, 1], then[i, 2]
             for s in range(len(moments)):
                 moments[s] = changed[s]
-            if joint is None:
-                write_chords(now, k, i, D)
-                for x in range(k + 1):
-                    t[x] = trial[x]
+            write_chords(now, k, i, D)
+            for x in range(k + 1):
+                t[x] = trial[x]

@@ -8,12 +8,14 @@ from netdesign.model.frames import sphere_directions
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
+from netdesign.motion.joint_tour import law_of
+from netdesign.motion.tour import path_length
 from netdesign.photogrammetry.datum import inner_basis
 from netdesign.photogrammetry.limited_error import blocked
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.placement.coverage import coverage
 from netdesign.placement.encoding import Chromosomes
-from netdesign.placement.evaluation import MAX_SIGMA, MEAN_VARIANCE, JointTables, SphereTables, motion_objective
+from netdesign.placement.evaluation import MAX_SIGMA, MEAN_VARIANCE, JointTables, SphereTables, joint_tours
 from netdesign.placement.set_cover import CANDIDATES, Cover, lattice, smallest_cover
 from netdesign.placement.visibility_map import VisibilityMap
 
@@ -62,8 +64,23 @@ def sphere_tables(task: Task, visibility: VisibilityMap) -> SphereTables:
         min_rays=limits.min_rays,
         min_tags=max(1, -(-limits.min_points_per_image // CORNERS_PER_TAG)),
         criterion=MAX_SIGMA if task.study.objectives.precision == "max_sigma" else MEAN_VARIANCE,
-        longest=np.inf if longest is None else longest * (1e-3 if task.study.motion == "workspace" else 1.0),
+        in_joints=task.study.motion != "workspace",
+        longest=np.inf if longest is None or task.study.motion != "workspace" else 1e-3 * longest,
         limits=np.array([*sphere.azimuth, *sphere.elevation]),
+    )
+
+
+def joint_tables(task: Task, joint_map: JointMap | None) -> JointTables | None:
+    """What :func:`evaluation.joint_tours` reads, None when motion is measured in the workspace."""
+    if joint_map is None or task.cell is None:
+        return None
+    timed, longest = task.study.motion == "time", task.study.requirements.max_tour
+    return JointTables(
+        arrays=joint_map.arrays,
+        law=law_of(joint_map.arm),
+        timed=timed,
+        dwell=task.cell.dwell if timed else 0.0,
+        longest=np.inf if longest is None else longest,
     )
 
 
@@ -110,9 +127,12 @@ def hypervolume_scale(task: Task, tables: SphereTables, joint: JointTables | Non
     """
     bound = 1.5 * tables.variance * (task.sphere.radius**2) / slots
     samples = Chromosomes(sphere=task.sphere, slots=slots).uniform(np.random.default_rng(0), (20, slots))
-    longest = max(
-        motion_objective(viewpoints, sphere_directions(viewpoints), tables, joint)[0] for viewpoints in samples
-    )
+    if joint is None:
+        longest = max(tables.radius * path_length(directions) for directions in sphere_directions(samples))
+    else:
+        objectives = np.zeros((len(samples), 3))
+        joint_tours(np.ones(samples.shape[:2], np.bool_), samples, joint, objectives, np.zeros(len(samples)))
+        longest = float(objectives[:, 1].max())
     if tables.criterion == MAX_SIGMA:
         ideal, reference = 0.5 * np.log(bound), 0.5 * np.log(100 * bound)
     else:

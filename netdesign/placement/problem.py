@@ -13,7 +13,6 @@ from netdesign.model.progress import Progress, silent
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
-from netdesign.motion.joint_tour import law_of
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_trace import total_trace
 from netdesign.placement.encoding import LARGEST_STEP, SMALLEST_STEP, Chromosomes
@@ -21,9 +20,16 @@ from netdesign.placement.evaluation import (
     JointTables,
     SphereTables,
     evaluate_networks,
+    joint_tours,
 )
 from netdesign.placement.local_search import ADD, MOVE, REMOVE, Tries, improve_networks
-from netdesign.placement.preparation import datum_gauge, demanded_cover, hypervolume_scale, sphere_tables
+from netdesign.placement.preparation import (
+    datum_gauge,
+    demanded_cover,
+    hypervolume_scale,
+    joint_tables,
+    sphere_tables,
+)
 from netdesign.placement.set_cover import Cover
 from netdesign.placement.visibility_map import VisibilityMap
 from netdesign.search.population import Population
@@ -73,10 +79,7 @@ class Problem:
         tables = sphere_tables(task, visibility)
         cover = demanded_cover(task, visibility, joint_map, tables)
         slots = min(task.sphere.max_images, task.study.requirements.max_images or task.sphere.max_images)
-        joint = None
-        if joint_map is not None and task.cell is not None:
-            timed = task.study.motion == "time"
-            joint = JointTables(joint_map.arrays, law_of(joint_map.arm), timed, task.cell.dwell if timed else 0.0)
+        joint = joint_tables(task, joint_map)
         problem = Problem(
             task=task,
             chromosomes=Chromosomes(sphere=task.sphere, slots=slots),
@@ -98,12 +101,24 @@ class Problem:
 
         def part(start: int) -> None:
             rows = slice(start, start + CHUNK)
-            evaluate_networks(bits[rows], genes[rows], self.tables, self.joint, objectives[rows], violation[rows])
+            evaluate_networks(bits[rows], genes[rows], self.tables, objectives[rows], violation[rows])
 
         self._share_out(part, range(0, len(bits), CHUNK))
+        self._complete(bits, genes, objectives, violation)
+        return objectives, violation
+
+    def _complete(self, bits: Bools, genes: Floats, objectives: Floats, violation: Floats) -> None:
+        """Put in what the kernels leave out: tours in joints, total propagation."""
+        joint = self.joint
+        if joint is not None:
+
+            def part(start: int) -> None:
+                rows = slice(start, start + CHUNK)
+                joint_tours(bits[rows], genes[rows], joint, objectives[rows], violation[rows])
+
+            self._share_out(part, range(0, len(bits), CHUNK))
         if self.gauge is not None:
             self._propagate_totally(bits, genes, objectives, violation)
-        return objectives, violation
 
     def _propagate_totally(self, bits: Bools, genes: Floats, objectives: Floats, violation: Floats) -> None:
         """Replace f1 of the feasible rows by total error propagation; what it cannot determine becomes infeasible."""
@@ -181,7 +196,7 @@ class Problem:
             rows = slice(start, start + 1)
             own = Tries(*(draw[rows] for draw in tries))  # type: ignore[arg-type]
             improve_networks(
-                viewpoints[rows], sizes[rows], own, self.tables, self.joint,
+                viewpoints[rows], sizes[rows], own, self.tables,
                 genes[rows], used[rows], objectives[rows], violation[rows],
             )  # fmt: skip
 
@@ -191,8 +206,7 @@ class Problem:
         bits, genes = np.arange(slots) < sizes[:, None], genes.reshape(-1, slots, 2)[tried]
         full = np.column_stack([objectives.reshape(-1, 2)[tried], sizes])
         violation = violation.ravel()[tried]
-        if self.gauge is not None:
-            self._propagate_totally(bits, genes, full, violation)
+        self._complete(bits, genes, full, violation)
         return Population(bits=bits, genes=genes, objectives=full, violation=violation)
 
     def normalise(self, objectives: Floats) -> Floats:

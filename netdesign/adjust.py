@@ -54,7 +54,7 @@ def adjust_folder(
     Args:
         sigma_px: image-coordinate noise, instead of what the set says.
         datum: None takes control if the set has control points, else scale if it has scale bars, else free.
-        datum_points: names of the points that carry the inner constraints, None for all.
+        datum_points: names of the points that carry the inner constraints, None or none for all.
         control, scale_bars: files, instead of control.csv and scalebars.csv in the folder.
         refine: interior parameters to estimate.  robust: find and reject gross errors.
         out: folder for adjustment.json, None for ``folder``.
@@ -118,7 +118,7 @@ def _mask(names: Sequence[str] | None, point_names: Sequence[str]) -> Bools | No
     Raises:
         InputError: a name that no point has.
     """
-    if names is None:
+    if not names:
         return None
     unknown = [name for name in names if name not in point_names]
     if unknown:

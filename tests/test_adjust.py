@@ -248,6 +248,20 @@ def test_bad_input_is_one_clear_line(tmp_path):
         adjust_folder(folder, scale_bars=bars)
 
 
+def test_nan_in_the_model_and_empty_lists_of_the_command_line(tmp_path):
+    poses, points, observations = _case()
+    xy = observations.xy_px.copy()
+    xy[5, 1] = np.nan
+    spoilt = type(observations)(
+        image=observations.image, point=observations.point, xy_px=xy, covariance=observations.covariance
+    )
+    _write(tmp_path / "nan", poses, points, spoilt)
+    with pytest.raises(InputError, match=r"images\.txt:6: expected finite numbers, found nan"):
+        adjust_folder(tmp_path / "nan")
+    _write(tmp_path / "good", poses, points, observations)
+    assert adjust_folder(tmp_path / "good", datum_points=[], refine=[]).adjustment.parameter_names == ()
+
+
 def test_control_point_that_is_nowhere_seen(tmp_path):
     poses, points, observations = _case()
     visible = np.zeros((8, 40), bool)

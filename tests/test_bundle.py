@@ -6,6 +6,7 @@ import pytest
 from netdesign.adjustment.bundle import adjust
 from netdesign.adjustment.estimate import estimate
 from netdesign.errors import InfeasibleError, InputError
+from netdesign.model.frames import pose, sphere_directions
 from netdesign.photogrammetry.datum import point_null_space
 from netdesign.photogrammetry.observation_equations import parameter_matrix
 from tests.bundle_cases import (
@@ -174,6 +175,20 @@ def test_flat_object_with_free_intrinsics_and_no_roll_is_refused_with_advice():
     rolled, _ = relief(6, 1, seed=6, roll=True, elevation=(55, 55.1))
     observations = observe(rolled, points, np.ones((6, 40), bool))
     assert estimate(problem_of(observations, rolled, points, refine=("f", "cx", "cy"))).converged
+
+
+@pytest.mark.parametrize(("images", "elevation"), [(4, 40.0), (6, 55.0), (8, 70.0)])
+def test_upright_images_around_a_flat_object_name_the_parameter(images, elevation):
+    _, points = relief(6, 40, seed=6)
+    points[:, 2] = 0.0
+    alpha = np.arange(images) * 2 * np.pi / images + 0.2
+    beta = np.full(images, np.radians(elevation))
+    position = sphere_directions(np.stack([alpha, beta], axis=1))
+    x_axis = np.stack([-np.sin(alpha), np.cos(alpha), 0 * alpha], axis=1)
+    poses = pose(np.stack([x_axis, np.cross(-position, x_axis), -position], axis=-1), position)
+    observations = observe(poses, points, np.ones((images, 40), bool))
+    with pytest.raises(InfeasibleError, match=r"not determine: .*cy .*advice: .*rolled by 90"):
+        estimate(problem_of(observations, poses, points, refine=("f", "cx", "cy")))
 
 
 def test_intrinsics_start_enters_only_as_a_start():

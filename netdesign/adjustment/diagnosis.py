@@ -14,6 +14,7 @@ POINT_CONDITION = 1e-9  # of a point's normals: below it its rays are parallel
 HOPELESS_DEPTH = 0.2  # sigma over distance above which a point counts as not determined
 WEAK_DEPTH = 0.01  # sigma over distance above which its ray geometry is named; many such points are a broken network
 WEAK_SHARE = 0.1
+CLOSE_BASELINE = 0.01
 CORRELATION = 0.95
 NOT_DETERMINED = 200.0  # effect of a parameter's sigma in the image, in sigmas of one image coordinate
 NOT_DETERMINED_FLAT = 10.0  # the same for a flat object seen without roll, where tilt stands in for the parameter
@@ -50,6 +51,20 @@ def depth_weakness(problem: BundleProblem, layout: Layout, reduced: Reduced) -> 
     np.minimum.at(distance, observations.point, np.linalg.norm(ray, axis=1))
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(reduced.inverse)[:, -1], 0.0))
     return np.where(layout.eliminated, spread / distance, 0.0)
+
+
+def coinciding_images(problem: BundleProblem) -> tuple[str, ...]:
+    """Return pairs of images whose baseline is below CLOSE_BASELINE of their distance to the points.
+
+    Harmless among others; in a network that fails they are the first suspects.
+    """
+    position = problem.world_from_cam[:, :3, 3]
+    distance = np.linalg.norm(position - problem.points.mean(axis=0), axis=1)
+    baseline = np.linalg.norm(position[:, None] - position[None], axis=2)
+    close = np.triu(baseline < CLOSE_BASELINE * np.minimum(distance[:, None], distance[None]), 1)
+    names = problem.image_names
+    pairs = [f"{names[i]} and {names[j]}" for i, j in np.argwhere(close).tolist()]
+    return (f"images (nearly) at one position: {listed(pairs)}",) if pairs else ()
 
 
 def rolls_alike(poses: Floats) -> bool:

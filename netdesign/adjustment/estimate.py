@@ -11,7 +11,13 @@ import numpy as np
 from scipy.stats import chi2
 
 from netdesign.adjustment.covariance import datum_covariance
-from netdesign.adjustment.diagnosis import calibration_complaints, depth_weakness, point_complaints, quality_warnings
+from netdesign.adjustment.diagnosis import (
+    calibration_complaints,
+    coinciding_images,
+    depth_weakness,
+    point_complaints,
+    quality_warnings,
+)
 from netdesign.adjustment.problem import BundleProblem, check_input, check_start, null_space
 from netdesign.adjustment.snooping import cleaned
 from netdesign.adjustment.solver import Solution, equations, solve
@@ -53,15 +59,29 @@ def estimate(
     rejected: tuple[Rejection, ...] = ()
     dropped: tuple[int, ...] = ()
     before = 0
-    if robust:
-        scaled, rejected, dropped, before = cleaned(scaled, significance, sigma_known)
+    exact = _open_at(scaled)[0] if scaled.refine else ()
+    if exact:
+        raise InfeasibleError("; ".join(exact + calibration_complaints(scaled, scaled.refine, None)))
     try:
+        if robust:
+            scaled, rejected, dropped, before = cleaned(scaled, significance, sigma_known)
         solution = anchored(solve(scaled), start)
     except InfeasibleError as error:
-        advice = calibration_complaints(scaled, scaled.refine, None)
-        raise InfeasibleError("; ".join([str(error), *advice])) from None
+        weak = _open_at(scaled)[1] or calibration_complaints(scaled, scaled.refine, None)
+        raise InfeasibleError("; ".join([str(error), *coinciding_images(scaled), *weak])) from None
     adjustment = appraise(solution, unit, centre, joint, rejected, dropped)
     return replace(adjustment, iterations=adjustment.iterations + before)
+
+
+def _open_at(problem: BundleProblem) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return what the normal equations leave open at the approximate values, and weakly determined parameters."""
+    layout = problem.layout()
+    linearised, rows = equations(problem, layout, whitener(problem.observations.covariance))
+    names = _parameter_names(problem)
+    camera_side = invert_camera_side(reduce_normals(linearised), null_space(problem, layout)[0], rows[:, :-1])
+    first, last = 6 * layout.images, int(layout.parameter_start[-1])
+    weak = calibration_complaints(problem, names, camera_side.inverse[first:last, first:last])
+    return numeric_complaints(camera_side, layout.images, problem.image_names, names), weak
 
 
 def datum_mask(problem: BundleProblem, layout: Layout) -> Bools:

@@ -146,8 +146,9 @@ def test_sigmas_of_another_run_are_noticed(tmp_path):
     design = read_json(tmp_path / "run" / "design.json", "design")
     design["networks"][0]["sigma_um"][5][1] *= 1.01
     write_json(tmp_path / "run" / "design.json", "design", design)
-    assert read_run(tmp_path / "run").recomputed == pytest.approx(0.01, rel=1e-6)
-    assert "do not belong together" in write_report(tmp_path / "run").read_text(encoding="utf-8")
+    record = read_run(tmp_path / "run")
+    assert record.recomputed == pytest.approx(0.01, rel=1e-6)
+    assert "do not belong together" in words.all_flags(record)[0]["text"]
 
 
 def test_a_folder_that_is_no_run_is_an_input_error(tmp_path):
@@ -248,19 +249,38 @@ def test_a_design_that_assumed_another_noise_is_flagged(proved):
     assert "not that of the detector" in text
 
 
+PLAY = """<script>
+const motion = document.getElementById("plot-motion"), table = document.getElementById("table");
+motion.emit("plotly_click", { points: [{ customdata: 2 }] });
+motion.emit("plotly_selected", { points: [{ customdata: 0 }, { customdata: 2 }] });
+table.querySelector("th[data-key=tour] button").click();
+table.querySelector("th[data-key=tour] button").click();
+document.querySelector("article.shown details.points").open = true;
+</script>"""
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
-def test_a_browser_draws_every_figure_without_an_error(proved, tmp_path):
+def test_a_browser_draws_every_figure_and_selects_brushes_and_sorts(proved, tmp_path):
+    (tmp_path / "play.html").write_text(proved[1].replace("</body>", PLAY + "</body>"), encoding="utf-8")
     command = [
         "chromium", "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
         "--disable-background-networking", "--disable-component-update", "--disable-sync",
-        f"--user-data-dir={tmp_path}", "--enable-unsafe-swiftshader", "--use-angle=swiftshader",
-        "--virtual-time-budget=20000", "--enable-logging=stderr", "--dump-dom",
-        f"file://{proved[0] / 'report.html'}",
+        f"--user-data-dir={tmp_path / 'profile'}", "--enable-unsafe-swiftshader", "--use-angle=swiftshader",
+        "--virtual-time-budget=20000", "--enable-logging=stderr", "--dump-dom", f"file://{tmp_path / 'play.html'}",
     ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=180, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
     assert "Uncaught" not in done.stderr
-    assert len(re.findall(r'class="plot[^"]*js-plotly-plot', done.stdout)) == 7
+    page = done.stdout
+    assert len(re.findall(r'class="plot[^"]*js-plotly-plot', page)) == 7
+    assert re.findall(r'class="network card shown" id="network-(\d+)"', page) == ["0002"]
+    rows = re.findall(r'<tr data-id="(\d+)" tabindex="0"([^>]*)>', page)
+    assert {number for number, state in rows if "dim" in state} == {number for number, _ in rows} - {"0", "2"}
+    design = read_json(proved[0] / "design.json", "design")
+    tours = {str(network["id"]): network["objectives"][1] for network in design["networks"]}
+    assert [number for number, _ in rows] == sorted(tours, key=tours.get, reverse=True)
+    opened = re.search(r'<details class="points[^>]*open.*?</details>', page, flags=re.DOTALL)[0]
+    assert opened.count("<tr>") == 1 + len(design["points"])
 
 
 def test_interval_rows_say_inside_or_outside():

@@ -18,7 +18,7 @@ import numpy as np
 from gtsam.symbol_shorthand import K, L, X
 
 from netdesign.adjustment.estimate import anchored, appraise
-from netdesign.adjustment.problem import BundleProblem, check_input, check_start
+from netdesign.adjustment.problem import BundleProblem, check_input, check_start, null_space
 from netdesign.adjustment.solver import newton_decrement, solution_at
 from netdesign.errors import InfeasibleError
 from netdesign.model.adjustment import Adjustment
@@ -87,7 +87,7 @@ def adjust(
         )
     solution = anchored(solution_at(solved, iterations), scaled.points)
     adjustment = appraise(solution, unit, centre, False, (), ())
-    joint = _joint(solution.problem, adjustment.used) * unit**2
+    joint = joint_marginals(solution.problem, adjustment.used) * unit**2
     covariance = np.full_like(adjustment.point_covariance, np.inf)
     covariance[adjustment.used] = blocks(joint)[adjustment.used]
     difference = np.linalg.norm(covariance[adjustment.used] - adjustment.point_covariance[adjustment.used])
@@ -102,7 +102,7 @@ def adjust(
 def _graph(problem: BundleProblem) -> tuple[Any, Any]:
     """Return the factor graph with its gauge and the values at the problem's approximations; unit lengths."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    observations, count = problem.observations, len(problem.world_from_cam)
+    observations = problem.observations
     calibration = gtsam.Cal3DS2(*_cal3ds2(problem.intrinsics[0]))
     for i, pose in enumerate(problem.world_from_cam):
         values.insert(X(i), gtsam.Pose3(pose))
@@ -128,18 +128,30 @@ def _graph(problem: BundleProblem) -> tuple[Any, Any]:
             graph.add(gtsam.GeneralSFMFactor2Cal3DS2(xy, gaussian(covariance), X(i), L(j), K(0)))
         else:
             graph.add(gtsam.GenericProjectionFactorCal3DS2(xy, gaussian(covariance), X(i), L(j), calibration))
-    position = problem.world_from_cam[:, :3, 3]
-    distance = np.linalg.norm(position - position[0], axis=1)
-    far = int(np.argmax(distance))
-    graph.add(
-        gtsam.PriorFactorPose3(
-            X(0), gtsam.Pose3(problem.world_from_cam[0]), gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SIGMA)
-        )
-    )
-    if count > 1:
-        noise = gtsam.noiseModel.Isotropic.Sigma(1, GAUGE_SIGMA)
-        graph.add(gtsam.RangeFactorPose3(X(0), X(far), float(distance[far]), noise))
+    _add_datum(graph, problem)
     return graph, values
+
+
+def _add_datum(graph: Any, problem: BundleProblem) -> None:
+    """Add weighted control and scale bars, and a gauge of exactly as many constraints as stay open."""
+    isotropic = gtsam.noiseModel.Isotropic.Sigma
+    control, bars = problem.active_control, problem.active_bars
+    if control is not None:
+        for j, xyz, sigma in zip(control.point.tolist(), control.xyz, control.sigma.tolist(), strict=True):
+            graph.add(gtsam.PriorFactorPoint3(L(j), xyz, isotropic(3, sigma)))
+    if bars is not None:
+        for a, b, length, sigma in zip(
+            bars.a.tolist(), bars.b.tolist(), bars.length.tolist(), bars.sigma.tolist(), strict=True
+        ):
+            graph.add(gtsam.RangeFactor3(L(a), L(b), length, isotropic(1, sigma)))
+    open_ = null_space(problem, problem.layout())[0].shape[1]
+    if open_ >= 6:
+        graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(problem.world_from_cam[0]), isotropic(6, GAUGE_SIGMA)))
+    if open_ == 7:
+        position = problem.world_from_cam[:, :3, 3]
+        distance = np.linalg.norm(position - position[0], axis=1)
+        far = int(np.argmax(distance))
+        graph.add(gtsam.RangeFactorPose3(X(0), X(far), float(distance[far]), isotropic(1, GAUGE_SIGMA)))
 
 
 def _cal3ds2(intrinsics: Floats) -> list[float]:
@@ -181,8 +193,13 @@ def _estimates(problem: BundleProblem, result: Any) -> BundleProblem:
     return replace(problem, world_from_cam=poses, points=points, intrinsics=intrinsics)
 
 
-def _joint(problem: BundleProblem, used: Bools) -> Floats:
-    """Return GTSAM's joint covariance (3m, 3m) of the points in the problem's free datum, inf for unused points.
+def joint_marginals(problem: BundleProblem, used: Bools) -> Floats:
+    """Return GTSAM's joint covariance (3m, 3m) of the points in the problem's datum, inf for unused points.
+
+    Args:
+        problem: at its minimum, lengths in units of the object's extent. Control must be weighted, not error-free
+            (GTSAM's marginals do not take hard constraints), and so must scale bars.
+        used: (m,) points that have an estimate.
 
     Raises:
         InfeasibleError: GTSAM finds the system indeterminate.
@@ -196,7 +213,10 @@ def _joint(problem: BundleProblem, used: Bools) -> Floats:
         reason = str(error).strip().splitlines()[0]
         raise InfeasibleError(f"GTSAM finds the network indeterminate: {reason}") from None
     datum = None if problem.datum_points is None else problem.datum_points[index]
-    covariance = s_transformation(np.asarray(marginal), problem.points[index], datum)
+    open_ = null_space(problem, problem.layout())[0].shape[1]
+    covariance = np.asarray(marginal)
+    if open_ >= 6:
+        covariance = s_transformation(covariance, problem.points[index], datum, open_)
     count = len(used)
     joint = np.zeros((3 * count, 3 * count))
     rows = (3 * index[:, None] + np.arange(3)).ravel()

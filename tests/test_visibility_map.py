@@ -169,6 +169,12 @@ def test_the_cache_gives_the_same_map_survives_damage_and_knows_its_input(tmp_pa
     assert len(list((tmp_path / "netdesign").iterdir())) == 2
 
 
+def test_a_cache_that_cannot_be_written_is_no_cache(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert VisibilityMap.build(plate_scene(side=1), CAMERA, sphere(), LIMITS, step=COARSE).sure.any()
+
+
 def test_more_than_64_tags_take_a_second_word():
     scene = plate_scene(side=9, spacing=0.03)
     grid_map = VisibilityMap.build(scene, CAMERA, sphere(), LIMITS, step=COARSE)

@@ -5,12 +5,12 @@ decision. No bit: the tag is seen from nowhere in the cell. The proofs are in ``
 bits is therefore conservative, and sure or maybe together cover every sighting that exists (which ``bound`` needs).
 """
 
+import contextlib
 import hashlib
 import os
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 
 import numba
 import numpy as np
@@ -236,10 +236,12 @@ def _read(path: Path) -> Words | None:
 
 def _write(path: Path, rows_of_bits: Words) -> None:
     """Write beside the place, then rename; a cache that cannot be written is no cache."""
+    beside = path.with_suffix(f".{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as scratch:
+        with beside.open("wb") as scratch:
             np.savez_compressed(scratch, bits=rows_of_bits)
-        os.replace(scratch.name, path)
+        beside.replace(path)
     except OSError:
-        return
+        with contextlib.suppress(OSError):
+            beside.unlink()

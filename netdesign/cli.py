@@ -185,7 +185,10 @@ def calibrate_noise(
 def adjust(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="image set or observation set", show_default=False)],
     sigma_px: Annotated[float | None, typer.Option(help="image-coordinate noise; default: the set's own")] = None,
-    datum: Annotated[Literal["free", "fixed", "control", "scale"], typer.Option(help="what fixes the frame")] = "free",
+    datum: Annotated[
+        Literal["free", "fixed", "control", "scale"] | None,
+        typer.Option(help="what fixes the frame; default: what the set brings, else free"),
+    ] = None,
     datum_points: Annotated[str | None, typer.Option(help="a,b,c…: points of the inner constraints")] = None,
     control: Annotated[Path | None, typer.Option(help="CSV: point,x_mm,y_mm,z_mm,sigma_mm")] = None,
     scale_bars: Annotated[Path | None, typer.Option(help="CSV: a,b,length_mm,sigma_mm")] = None,

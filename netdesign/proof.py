@@ -15,9 +15,10 @@ import numpy as np
 from netdesign.adjustment.bundle import adjust
 from netdesign.adjustment.compare import compare
 from netdesign.adjustment.estimate import estimate
+from netdesign.adjustment.lengths import length_test
 from netdesign.adjustment.problem import BundleProblem
 from netdesign.errors import EnvironmentProblem, InputError, NetdesignError
-from netdesign.files.adjustment import adjustment_payload, validation_payload
+from netdesign.files.adjustment import adjustment_payload, length_payload, validation_payload
 from netdesign.files.design_json import PlannedNetwork
 from netdesign.files.store import read_json, write_json, write_text
 from netdesign.imageset import image_name, measure_images, observations_of, render_images
@@ -89,13 +90,15 @@ def prove_network(
     try:
         adjustment = _adjusted(task, network, observations, names)
         limited, total = predictions(task, network)
-        validation = compare(task.scene.targets.points, adjustment, limited, total, level, seed=task.study.seed)
+        truth = task.scene.targets.points
+        validation = compare(truth, adjustment, limited, total, level, seed=task.study.seed)
+        lengths = length_payload(length_test(truth, adjustment), point_ids)
     except EnvironmentProblem:
         raise
     except NetdesignError as error:
         record |= {"verdict": "failed", "passed": False, "reasons": [str(error)], "warnings": []}
     else:
-        record |= validation_payload(validation, point_ids)
+        record |= validation_payload(validation, point_ids) | lengths
         record["verdict"] = "pass" if validation.passed else "fail"
         record["rejected_image_points"] = len(adjustment.rejected)
         write_json(

@@ -6,6 +6,7 @@ import pytest
 from netdesign.imaging.detect import detect
 from netdesign.imaging.measure import Gates, measure
 from netdesign.imaging.optics import expose, noise_generator
+from netdesign.imaging.pictures import linear
 from netdesign.imaging.reference import ReferenceRenderer
 from netdesign.model.frames import inverse, look_at, sphere_directions
 from netdesign.photogrammetry.collinearity import project
@@ -52,6 +53,7 @@ def test_floor_is_added_to_every_variance(picture):
         (Gates(chi2_base=0.1, chi2_sigmas=0), "chi2"),
         (Gates(max_seed_shift_cells=0, min_seed_shift_px=0), "seed"),
         (Gates(border_px=200), "frame"),
+        (Gates(max_clipped=-1), "clipped"),
     ],
 )
 def test_every_gate_gives_its_reason(picture, gates, reason):
@@ -85,3 +87,20 @@ def test_sixteen_bit_pictures_are_measured_alike(picture):
 
 def test_an_empty_picture_has_no_tags():
     assert measure(np.zeros((420, 500), np.uint8), CAM, "tag36h11", 0.02) == []
+
+
+def test_an_unknown_sensor_is_judged_by_the_picture_itself(picture):
+    camera = replace(CAM, full_well_e=4500.0)  # claims a third of the true noise
+    assert all("chi2" in tag.rejected for tag in measure(picture, camera, "tag36h11", 0.02))
+    found = measure(picture, camera, "tag36h11", 0.02, gates=Gates(own_noise=True))
+    assert {tag.rejected for tag in found} == {""}
+    right = measure(picture, CAM, "tag36h11", 0.02)
+    ratio = [a.covariance_px2.trace() / b.covariance_px2.trace() for a, b in zip(found, right, strict=True)]
+    np.testing.assert_allclose(ratio, 1.0, atol=0.2)
+
+
+def test_gamma_is_undone(picture):
+    bent = np.rint(255 * (picture / 255.0) ** (1 / 2.2)).astype(np.uint8)
+    straight = measure(linear(bent, 2.2), CAM, "tag36h11", 0.02)
+    plain = measure(picture, CAM, "tag36h11", 0.02)
+    np.testing.assert_allclose([tag.corners_px for tag in straight], [tag.corners_px for tag in plain], atol=0.01)

@@ -1,5 +1,7 @@
 """pyrender and the reference renderer: two implementations that share nothing but the scene and the blur."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -133,3 +135,33 @@ def test_tags():
         cells("tag36h11", 587)
     with pytest.raises(InputError, match="tag36h11"):
         cells("tag99", 0)
+
+
+WITHOUT_EGL = """
+import ctypes, ctypes.util
+real_find, real_load = ctypes.util.find_library, ctypes.CDLL.__init__
+ctypes.util.find_library = lambda name: None if "EGL" in name else real_find(name)
+def load(self, name, *args, **kwargs):
+    if name and "EGL" in str(name):
+        raise OSError(f"{name}: cannot open shared object file")
+    real_load(self, name, *args, **kwargs)
+ctypes.CDLL.__init__ = load
+import numpy as np
+from netdesign.errors import EnvironmentProblem
+from netdesign.imaging.photograph import Photographer, Shoot
+from netdesign.imaging.render import probe
+from tests.test_render import SMALL, plate_scene, poses
+try:
+    probe()
+except EnvironmentProblem as problem:
+    print(problem)
+picture = Photographer(plate_scene(side=1), SMALL, Shoot(renderer="reference")).take(0, poses(1, 0.4)[0])
+print(picture.shape)
+"""
+
+
+def test_without_egl_the_packages_are_named_and_the_reference_renderer_works():
+    done = subprocess.run([sys.executable, "-c", WITHOUT_EGL], capture_output=True, text=True, check=True)
+    message, shape = done.stdout.strip().splitlines()
+    assert "libegl1 libgl1" in message
+    assert shape == "(600, 800)"

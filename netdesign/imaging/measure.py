@@ -23,7 +23,10 @@ class Gates:
         chi2_base, chi2_sigmas: largest chi²/dof is base + sigmas·sqrt(2/dof).
         max_seed_shift_cells: largest distance of a corner from its seed, in cells, at least ``min_seed_shift_px``.
         min_contrast: smallest (white - black) / full scale.
+        max_clipped: largest share of pixels at full scale in the tag's bounding box: clipping shrinks the black.
         border_px: a tag with a corner nearer to the frame's edge is not measured.
+        own_noise: for photographs of an unknown sensor or exposure: the noise is the sensor model times the median
+            chi²/dof of the picture's tags, and a tag is judged against that. It cannot see what all tags share.
     """
 
     max_incidence: float = float(np.radians(70.0))
@@ -33,7 +36,9 @@ class Gates:
     max_seed_shift_cells: float = 0.5
     min_seed_shift_px: float = 3.0
     min_contrast: float = 0.08
+    max_clipped: float = 0.02
     border_px: float = 2.0
+    own_noise: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,9 +85,16 @@ def measure(
     full_scale = 65535.0 if picture.dtype == np.uint16 else 255.0
     gain = full_scale / camera.full_well_e
     floor = (gain * camera.read_noise_e) ** 2 + 1 / 12
+    seeds = detect(picture, family, ids)
+    fits = [
+        fit_tag(picture, cells(family, seed.tag_id), seed.corners_px, camera.intrinsics, gain, floor) for seed in seeds
+    ]
+    scale = 1.0
+    if judge.own_noise and any(fit.converged for fit in fits):
+        scale = float(np.median([fit.chi2_per_dof for fit in fits if fit.converged]))
     measured = []
-    for seed in detect(picture, family, ids):
-        fit = fit_tag(picture, cells(family, seed.tag_id), seed.corners_px, camera.intrinsics, gain, floor)
+    for seed, raw in zip(seeds, fits, strict=True):
+        fit = replace(raw, covariance_px2=scale * raw.covariance_px2, chi2_per_dof=raw.chi2_per_dof / scale)
         edges = np.linalg.norm(np.roll(fit.corners_px, -1, axis=0) - fit.corners_px, axis=1)
         shift = float(np.linalg.norm(fit.corners_px - seed.corners_px, axis=1).max())
         incidence = _incidence(fit, size_m, camera.intrinsics) if fit.converged else float("nan")
@@ -91,7 +103,7 @@ def measure(
                 tag_id=seed.tag_id,
                 corners_px=fit.corners_px,
                 covariance_px2=fit.covariance_px2 + floor_px**2 * np.eye(8),
-                rejected=_reason(fit, judge, picture.shape, full_scale, float(edges.min()) / CELLS, shift, incidence),
+                rejected=_reason(fit, judge, picture, full_scale, float(edges.min()) / CELLS, shift, incidence),
                 chi2_per_dof=fit.chi2_per_dof,
                 pixels=fit.pixels,
                 sigma_px=fit.sigma_px,
@@ -118,14 +130,19 @@ def _incidence(fit: Fit, size_m: float, intrinsics: Floats) -> float:
 
 
 def _reason(
-    fit: Fit, gates: Gates, shape: tuple[int, ...], full_scale: float, cell_px: float, shift: float, incidence: float
-) -> str:
+    fit: Fit, gates: Gates, picture: NDArray[np.generic], full_scale: float, cell_px: float, shift: float,
+    incidence: float,
+) -> str:  # fmt: skip
     """Return why a fit is not believed, or ""."""
     if not fit.converged:
         return f"fit not converged after {fit.iterations} iterations"
     low, high = fit.corners_px.min(axis=0), fit.corners_px.max(axis=0)
-    if (low < gates.border_px).any() or (high > np.array(shape[::-1]) - 1 - gates.border_px).any():
+    if (low < gates.border_px).any() or (high > np.array(picture.shape[::-1]) - 1 - gates.border_px).any():
         return "cut by the frame"
+    (left, top), (right, bottom) = low.astype(int), high.astype(int) + 1
+    clipped = float(np.mean(np.greater_equal(picture[top:bottom, left:right], full_scale)))
+    if clipped > gates.max_clipped:
+        return f"{100 * clipped:.1f} % of the pixels clipped, at most {100 * gates.max_clipped:.1f} % allowed"
     if cell_px < gates.min_cell_px:
         return f"cell {cell_px:.2f} px, at least {gates.min_cell_px:.2f} px needed"
     if not incidence <= gates.max_incidence:

@@ -17,6 +17,17 @@ def png_bytes(picture: NDArray[np.generic]) -> bytes:
     return bytes(encoded)
 
 
+def linear(picture: NDArray[np.generic], gamma: float) -> NDArray[np.uint16]:
+    """Return a picture that was stored as level^(1/gamma) as 16-bit levels linear in light, which measuring needs.
+
+    Args:
+        gamma: 2.2 for most photographs; corners of a picture left as it is would shrink by 0.1 to 0.2 px.
+    """
+    full_scale = 65535 if picture.dtype == np.uint16 else 255
+    table = np.rint(65535 * (np.arange(full_scale + 1) / full_scale) ** gamma).astype(np.uint16)
+    return np.asarray(table[np.asarray(picture, np.int64)])
+
+
 def read_picture(path: Path) -> NDArray[np.generic]:
     """Read a picture as grey levels (h, w), uint8 or uint16; colour is averaged as OpenCV does.
 

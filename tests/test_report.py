@@ -241,12 +241,18 @@ def test_no_image_can_be_lost_for_free(proved):
         assert (network.without >= 1e-6 * network.rms_um * (1 - 1e-12)).all()
 
 
-def test_a_design_that_assumed_another_noise_is_flagged(proved):
+def test_a_gap_between_design_and_measurement_is_flagged_with_its_cause(proved):
     network = read_run(proved[0]).networks[0]
     assert words.design_gap(network) == []
-    told = {**network.validation, "predicted_rms_um": {"used": network.total_rms_um / 10}}
-    (text,) = words.design_gap(replace(network, validation=told))
+    points = network.adjustment["points"]
+    quiet = [{**item, "sigma_apriori_mm": [0.1 * value for value in item["sigma_apriori_mm"]]} for item in points]
+    (text,) = words.design_gap(replace(network, adjustment={**network.adjustment, "points": quiet}))
+    assert "0.1 times" in text
     assert "not that of the detector" in text
+    short = [{**points[0], "rays": int(network.rays[0]) - 1}, *points[1:]]
+    told = {**network.validation, "predicted_rms_um": {"used": 2 * network.total_rms_um}}
+    (text,) = words.design_gap(replace(network, validation=told, adjustment={**network.adjustment, "points": short}))
+    assert f"lost rays to tags that were not found or not used: {points[0]['id']}" in text
 
 
 PLAY = """<script>

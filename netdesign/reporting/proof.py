@@ -20,6 +20,9 @@ STATISTICS = (
 )
 
 
+LEAST_FOR_A_HISTOGRAM = 8
+
+
 def network_proof(network: NetworkRecord) -> Values | None:
     """Return chart and caption of a validated network; a chart without rows when it could not be adjusted."""
     content = network.validation
@@ -101,7 +104,7 @@ def campaign(record: RunRecord) -> Values | None:
     failed = [network.name for network in validated if scatter(network) is None]
     verdicts = []
     if "statement" in content:
-        verdicts.append({"kind": "good" if content["equivalent"] else "bad", "text": content["statement"]})
+        verdicts.append({"kind": _decision(content), "text": content["statement"]})
     if failed:
         verdicts.append({"kind": "bad", "text": f"Not in these figures, because they failed: {', '.join(failed)}."})
     counted = len(record.networks) - len(validated)
@@ -129,6 +132,14 @@ def campaign(record: RunRecord) -> Values | None:
         f"image points used (P2), datum: {words.SHORT_DATUM}. Dashed: equal; shaded: ten per cent. Crosses: outside "
         "their own intervals." + _trend(content),
     }
+
+
+def _decision(content: Values) -> str:
+    """Return good when equivalence is shown, bad when the opposite is, warn when the networks are too few to tell."""
+    if content["equivalent"]:
+        return "good"
+    apart = [row.high < row.margin[0] or row.low > row.margin[1] for row in _bands(content)]
+    return "bad" if any(apart) else "warn"
 
 
 def _bands(content: Values) -> list[charts.BandRow]:
@@ -167,7 +178,7 @@ def _histograms(content: Values) -> list[Markup]:
     return [
         charts.histogram_chart(pits[key], f"{label}   p = {p_values.get(key, float('nan')):.2g}", _bins(len(pits[key])))
         for key, label in names.items()
-        if pits.get(key)
+        if len(pits.get(key, ())) >= LEAST_FOR_A_HISTOGRAM
     ]
 
 

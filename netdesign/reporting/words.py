@@ -4,14 +4,14 @@ from collections import Counter
 
 import numpy as np
 
-from netdesign.reporting.record import NetworkRecord, RunRecord
+from netdesign.reporting.record import UM, NetworkRecord, RunRecord
 
 LIMITED_DATUM = "exterior orientation error-free (limited error propagation)"
 SHORT_DATUM = "inner constraints over all object points"
 
 RECOMPUTED = 1e-6  # largest relative difference that rounding may make between design.json and the report
 
-# Ratio P2 / P1 beyond which missed tags or pose errors no longer explain it: 20 % missed tags make 1.35.
+# Ratio of P2 to P1 beyond which there is something to say: 20 % missed tags make 1.35 (adjustment notes).
 DESIGN_GAP = (0.7, 1.5)
 
 GLOSSARY = (
@@ -133,15 +133,28 @@ def network_flags(network: NetworkRecord) -> list[dict[str, str]]:
 
 
 def design_gap(network: NetworkRecord) -> list[str]:
-    """Return a sentence when the image points really used promise another precision than the design assumed."""
+    """Return a sentence when the image points really used promise another precision than the design assumed.
+
+    The median over the points tells the noise level; the rms goes up when single points lose their rays.
+    """
     predicted = (network.validation or {}).get("predicted_rms_um", {})
     used, design = predicted.get("used"), network.total_rms_um
-    if used is None or not np.isfinite(design) or DESIGN_GAP[0] < used / design < DESIGN_GAP[1]:
+    if used is None or network.adjustment is None or not np.isfinite(design):
         return []
-    return [
-        f"The image points that were measured promise {used:.2f} µm (P2), the design {design:.2f} µm (P1): the image "
-        'noise assumed in [camera] is not that of the detector; noise = "detector" takes the calibrated one.'
-    ]
+    points = network.adjustment["points"]
+    sigma = np.array([item["sigma_apriori_mm"] for item in points], dtype=np.float64) * 1e3
+    typical = np.nanmedian(sigma / (np.sqrt(np.diagonal(network.total, axis1=1, axis2=2)) / UM))
+    told = f"The image points that were measured promise {used:.2f} µm (P2), the design {design:.2f} µm (P1): "
+    if not DESIGN_GAP[0] < typical < DESIGN_GAP[1]:
+        cause = (
+            f"a typical point has {typical:.2g} times the sigma of the design, so the image noise assumed in [camera] "
+        )
+        return [told + cause + 'is not that of the detector; noise = "detector" takes the calibrated one.']
+    if DESIGN_GAP[0] < used / design < DESIGN_GAP[1]:
+        return []
+    lost = [(int(item["rays"]) - int(planned), item["id"]) for item, planned in zip(points, network.rays, strict=True)]
+    names = ", ".join(name for change, name in sorted(lost) if change < 0)
+    return [told + f"single points lost rays to tags that were not found or not used: {names or 'none'}."]
 
 
 def all_flags(record: RunRecord) -> list[dict[str, str]]:

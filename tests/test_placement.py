@@ -8,12 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netdesign.errors import InfeasibleError
+from netdesign.model.camera import CornerNoise
 from netdesign.model.frames import sphere_directions
 from netdesign.model.scene import Scene, Targets
 from netdesign.model.study import Study
 from netdesign.model.task import Task
 from netdesign.motion.tour import nearest_neighbour_3opt
 from netdesign.photogrammetry.limited_error import limited_covariance
+from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.visibility import sightings
 from netdesign.placement.encoding import Chromosomes
 from netdesign.placement.finish import finish, spread
@@ -74,6 +76,22 @@ def test_evaluation_equals_numpy_on_the_same_bits(box):
         for row in range(50)
     ]
     assert (violation[:50] >= np.array(missing)).all()
+
+
+def test_the_detector_model_enters_the_search():
+    """Sigma per sighting comes from a table over 2 degree cells: f1 within a few percent of the exact one."""
+    task = task_of(plate_scene(side=3), max_images=8)
+    task = replace(task, camera=replace(CAMERA, corner_noise=CornerNoise(k=0.6, floor_px=0.01)))
+    problem = Problem.build(task)
+    bits, genes = problem.seeds()
+    objectives, violation = problem.evaluate(bits, genes)
+    for row in np.flatnonzero(violation <= 0)[:5]:
+        viewpoints = genes[row][bits[row]]
+        poses = task.sphere.cameras(viewpoints)
+        visible = np.repeat(problem.visibility.sure_tags(problem.visibility.cell_of(viewpoints)), 4, axis=1)
+        sigma = sighting_sigma(task.camera, poses, task.scene.targets)
+        covariance = limited_covariance(poses, task.scene.targets.points, CAMERA.intrinsics, visible, sigma)
+        assert objectives[row, 0] == pytest.approx(np.trace(covariance, axis1=1, axis2=2).mean() / 3, rel=0.03)
 
 
 @given(st.floats(-3, 3), st.floats(0.8, 1.5), st.integers(2, 6))

@@ -12,12 +12,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.motion.joint_tour import network_tour
 from netdesign.motion.tour import path_length
 from netdesign.photogrammetry.limited_error import LANES, add_four_cameras, variances_from_moments
 from netdesign.placement.visibility_map import cell_index
 
 MEAN_VARIANCE, MAX_SIGMA = 0, 1
+SEEN = (np.arange(LANES)[:, None] >> np.arange(LANES)[None] // CORNERS_PER_TAG & 1).astype(np.float64)
+"""(16, LANES): for four bits of a visibility row, 1.0 for every corner of the tags seen; a block holds four tags."""
 
 
 class SphereTables(NamedTuple):
@@ -26,7 +29,8 @@ class SphereTables(NamedTuple):
     Attributes:
         points: blocks of x, y, z relative to the centre (``limited_error.blocked``).  point_count: m.  tags: g.
         radius: R in m.  grid, sure: of the VisibilityMap.
-        weight: (rows, g) 1 / sigma² of a sighting relative to ``variance``; one row when sigma is constant.
+        weight: (rows, LANES per block) 1 / sigma² of a point's sighting relative to ``variance``; one row when sigma is
+            constant.
         weight_grid: (6,) grid of the rows of ``weight``.
         variance: m² per unit of the moment form, sigma² / f².
         min_rays, min_tags: images per tag, tags per image.
@@ -113,12 +117,14 @@ def write_weights(
     alpha: float, beta: float, cell: int, sign: float, slot: int, tables: SphereTables, weights: Floats
 ) -> None:
     """Write into ``slot`` of blocks of 4 rows what each point's sighting from a viewpoint weighs, times ``sign``."""
-    row = 0 if len(tables.weight) == 1 else cell_index(alpha, beta, tables.weight_grid)
-    for g in range(tables.tags):
-        bit = (tables.sure[cell, g >> 6] >> np.uint64(g & 63)) & np.uint64(1)
-        value = sign * tables.weight[row, g] if bit else 0.0
-        start = (g >> 2) * (4 * LANES) + slot * LANES + (g & 3) * 4
-        weights[start], weights[start + 1], weights[start + 2], weights[start + 3] = value, value, value, value
+    row = np.uint64(0 if len(tables.weight) == 1 else cell_index(alpha, beta, tables.weight_grid))
+    for block in range(tables.weight.shape[1] // LANES):
+        tag = np.uint64(4 * block)
+        four_tags = (tables.sure[cell, tag >> np.uint64(6)] >> (tag & np.uint64(63))) & np.uint64(15)
+        start, first = np.uint64((4 * block + slot) * LANES), np.uint64(block * LANES)
+        for index in range(LANES):
+            lane = np.uint64(index)
+            weights[start + lane] = sign * SEEN[four_tags, lane] * tables.weight[row, first + lane]
 
 
 @njit(cache=True, error_model="numpy")

@@ -11,7 +11,7 @@ from netdesign.motion.joint_map import JointMap
 from netdesign.motion.joint_tour import law_of
 from netdesign.motion.tour import path_length
 from netdesign.photogrammetry.datum import inner_basis
-from netdesign.photogrammetry.limited_error import blocked
+from netdesign.photogrammetry.limited_error import LANES, blocked
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.placement.coverage import coverage
 from netdesign.placement.encoding import Chromosomes
@@ -35,7 +35,7 @@ def sphere_tables(task: Task, visibility: VisibilityMap) -> SphereTables:
     camera, sphere, limits, targets = task.camera, task.sphere, task.limits, task.scene.targets
     points = targets.points
     tags = len(targets.ids)
-    weight, weight_grid = np.ones((1, tags)), visibility.grid
+    weight, weight_grid = np.ones((1, len(points))), visibility.grid
     if camera.corner_noise is not None:
         columns, rows = (
             max(1, int(np.ceil(count / inverse / NOISE_STEP)))
@@ -48,8 +48,7 @@ def sphere_tables(task: Task, visibility: VisibilityMap) -> SphereTables:
         alpha = weight_grid[0] + (np.arange(columns) + 0.5) / weight_grid[1]
         beta = weight_grid[3] + (np.arange(rows) + 0.5) / weight_grid[4]
         cells = np.stack([np.tile(alpha, rows), np.repeat(beta, columns)], axis=1)
-        sigma = sighting_sigma(camera, sphere.cameras(cells), targets).reshape(len(cells), tags, CORNERS_PER_TAG)
-        weight = (camera.sigma_px**2 / sigma**2).mean(axis=2)
+        weight = (camera.sigma_px / sighting_sigma(camera, sphere.cameras(cells), targets)) ** 2
     longest = task.study.requirements.max_tour
     return SphereTables(
         points=blocked((points - sphere.centre).T),
@@ -58,7 +57,7 @@ def sphere_tables(task: Task, visibility: VisibilityMap) -> SphereTables:
         radius=sphere.radius,
         grid=visibility.grid,
         sure=visibility.sure,
-        weight=np.ascontiguousarray(weight),
+        weight=np.pad(weight, ((0, 0), (0, -len(points) % LANES))),
         weight_grid=weight_grid,
         variance=float(camera.sigma_px**2 / (camera.focal_px**2).mean()),
         min_rays=limits.min_rays,

@@ -8,8 +8,9 @@ import pytest
 from netdesign.motion.collision import FREE, REASONS, states
 from netdesign.motion.joint_map import JointMap, options_at, solve_closed
 from netdesign.motion.kinematics import into_limits
-from tests.cells import PART, arm, cell, joint_map, viewpoints
-from tests.scenes import sphere
+from netdesign.motion.plan import plan_on
+from tests.cells import PART, arm, cell, joint_map, reachable_viewpoints, viewpoints
+from tests.scenes import box_part, sphere
 
 
 @pytest.mark.parametrize(("mount", "least"), [("side", 0.95), ("coaxial", 0.74)])
@@ -95,3 +96,14 @@ def test_flooded_sheets_cover_what_the_closed_form_covers():
     exact, found = solve_closed(arm("coaxial"), sphere().cameras(viewpoint[None]))
     gap = np.abs((exact[0][found[0]] - options[:, 0] + np.pi) % (2 * np.pi) - np.pi).max(axis=1)
     assert gap.min() < 0.02
+
+
+def test_capsules_that_always_overlap_leave_the_test_and_the_meshes_answer():
+    """The hub of a UR5's upper arm overlaps its base by capsules, never by meshes."""
+    small = box_part((0.1, 0.1, 0.08))
+    of_map = JointMap.build(cell("side", "ur5", base=(-0.4, 0.0, 0.0)), sphere(radius=0.4), small, grid=32)
+    assert of_map.arm.loose
+    assert not arm().loose
+    assert of_map.share()["free"] > 0.7
+    plan = plan_on(of_map, reachable_viewpoints(of_map, 4, 1))
+    assert not any(of_map.arm.meshes.contact(q) for q in plan.tour.joints)

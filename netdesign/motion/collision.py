@@ -40,8 +40,8 @@ class Body(NamedTuple):
     capsules (c, 7) in the frame of capsule_link (c,), 0 the base: both ends and the radius; the last `camera_parts` of
     them belong to the camera. pairs (s, 2): capsules that are tested against each other.
     boxes (b, 6): centre and half edge lengths; mounting (b,): the base stands on it, so link 1 is not tested against
-    it. field (x, y, z): lower bound of the distance to the part at the centre of each cell; field_origin (3,): centre
-    of cell 0; field_step: edge of a cell.
+    it and link 2 without the margin. field (x, y, z): lower bound of the distance to the part at the centre of each
+    cell; field_origin (3,): centre of cell 0; field_step: edge of a cell.
     margin: kept from part and obstacles. sight (k, 2): share of the way from camera to centre, radius that must be
     clear there; centre (3,): what the camera looks at.
     """
@@ -174,14 +174,10 @@ def touches_field(p, radius, field, origin, step):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy")
-def configuration_state(body, q, links, placed):  # type: ignore[no-untyped-def]
-    """Return FREE, SELF, PART, OBSTACLE or SIGHT for joints q (r,).
-
-    links (r, 3, 4) and placed (c, 6) are scratch: world_from_link and the capsules' ends in the world.
-    """
-    r, count = q.shape[0], body.capsules.shape[0]
+def _place(body, q, links, placed):  # type: ignore[no-untyped-def]
+    """Write world_from_link into links (r, 3, 4) and the capsules' ends in the world into placed (c, 6)."""
     link_poses(body.placements, q, links)
-    for c in range(count):
+    for c in range(body.capsules.shape[0]):
         link = body.capsule_link[c]
         for end in range(2):
             x, y, z = body.capsules[c, 3 * end], body.capsules[c, 3 * end + 1], body.capsules[c, 3 * end + 2]
@@ -191,6 +187,31 @@ def configuration_state(body, q, links, placed):  # type: ignore[no-untyped-def]
                 else:
                     m = links[link - 1]
                     placed[c, 3 * end + a] = m[a, 0] * x + m[a, 1] * y + m[a, 2] * z + m[a, 3]
+
+
+@njit(cache=True, error_model="numpy")
+def overlapping(body, joints):  # type: ignore[no-untyped-def]
+    """Return in how many of joints (n, r) each of the body's pairs (s,) overlaps."""
+    links, placed = np.empty((joints.shape[1], 3, 4)), np.empty((body.capsules.shape[0], 6))
+    hits = np.zeros(body.pairs.shape[0], dtype=np.int64)
+    for i in range(joints.shape[0]):
+        _place(body, joints[i], links, placed)
+        for s in range(body.pairs.shape[0]):
+            first, second = body.pairs[s, 0], body.pairs[s, 1]
+            radius = body.capsules[first, 6] + body.capsules[second, 6]
+            if _segment_segment(placed[first], placed[second]) < radius * radius:
+                hits[s] += 1
+    return hits
+
+
+@njit(cache=True, error_model="numpy")
+def configuration_state(body, q, links, placed):  # type: ignore[no-untyped-def]
+    """Return FREE, SELF, PART, OBSTACLE or SIGHT for joints q (r,).
+
+    links (r, 3, 4) and placed (c, 6) are scratch: world_from_link and the capsules' ends in the world.
+    """
+    r, count = q.shape[0], body.capsules.shape[0]
+    _place(body, q, links, placed)
     for c in range(count):
         if body.capsule_link[c] == 0:
             continue
@@ -200,7 +221,8 @@ def configuration_state(body, q, links, placed):  # type: ignore[no-untyped-def]
         for b in range(body.boxes.shape[0]):
             if body.mounting[b] and body.capsule_link[c] == 1:
                 continue
-            if touches_box(placed[c], radius, body.boxes[b]):
+            near = body.capsules[c, 6] if body.mounting[b] and body.capsule_link[c] == 2 else radius
+            if touches_box(placed[c], near, body.boxes[b]):
                 return OBSTACLE
     for s in range(body.pairs.shape[0]):
         first, second = body.pairs[s, 0], body.pairs[s, 1]

@@ -34,7 +34,7 @@ class Legs:
         key = start.tobytes() + end.tobytes()
         if key not in self._known:
             found = ""
-            if leg_state(self._arm.body, start, end, _STEP) != FREE:
+            if self._arm.loose or leg_state(self._arm.body, start, end, _STEP) != FREE:
                 found = self._arm.meshes.leg_contact(start, end, _STEP)
             self._known[key] = found
         return self._known[key]
@@ -80,7 +80,9 @@ class Legs:
         return None
 
     def _clear(self, start: Floats, end: Floats) -> bool:
-        return bool(leg_state(self._arm.body, start, end, _STEP) == FREE)
+        if leg_state(self._arm.body, start, end, _STEP) != FREE:
+            return False
+        return not (self._arm.loose and self._arm.meshes.leg_contact(start, end, _STEP))
 
     def _candidates(self, middle: Floats) -> Floats:
         arrays, placed = self._map.arrays, self._arm.placed

@@ -104,7 +104,9 @@ class MeshCell:
             for name, item in self._around:
                 if solid.link == 1 and name in self._mounting:
                     continue
-                if coal.collide(solid.item, item, self._near, coal.CollisionResult()):
+                # Links 1 and 2 are by construction near what the base stands on.
+                request = self._touch if solid.link == 2 and name in self._mounting else self._near
+                if coal.collide(solid.item, item, request, coal.CollisionResult()):
                     return f"{solid.name} touches {name}"
         for first, second in self.pairs.tolist():
             if self.touching(first, second):
@@ -119,6 +121,11 @@ class MeshCell:
             if found:
                 return found
         return ""
+
+    def touches_itself(self, q: Floats) -> bool:
+        """Return whether the arm touches itself at joints q (r,)."""
+        self.place(q)
+        return any(self.touching(first, second) for first, second in self.pairs.tolist())
 
     @property
     def mounting(self) -> Bools:

@@ -48,6 +48,8 @@ def exact_options(joint_map: JointMap, viewpoints: Floats) -> StationOptions:
     for index, (joints, label, reason) in enumerate(found):
         state = states(arm.body, joints) if len(joints) else np.zeros(0, dtype=np.int8)
         free = state == FREE
+        if arm.loose:
+            free[free] = [not arm.meshes.contact(q) for q in joints[free]]
         if len(joints) and not free.any():
             free = _free_on_meshes(arm, joints)
             reason = REASONS[int(np.bincount(state).argmax())]

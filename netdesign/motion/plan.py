@@ -205,8 +205,8 @@ def _repaired(
     candidates = []
     for _, tour, _ in starts[:2]:
         options = lifted(modulo.options, _best_through(modulo, tour), lower, upper)
-        count, labels = len(options.count), int(options.label.max()) + 1
-        barred = np.zeros((count, count, labels, labels))
+        stations, turns = len(options.count), int(options.label.max()) + 1
+        barred = np.zeros((stations, stations, turns, turns))
         problem = _Problem(options, _plain(modulo.law), modulo.timed, barred)
         candidates.append((problem.tour(tour), problem))
     (_, tour, _), problem = min(candidates, key=lambda item: item[0][0])

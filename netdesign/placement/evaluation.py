@@ -19,8 +19,6 @@ from netdesign.photogrammetry.limited_error import LANES, add_four_cameras, vari
 from netdesign.placement.visibility_map import cell_index
 
 MEAN_VARIANCE, MAX_SIGMA = 0, 1
-SEEN = (np.arange(LANES)[:, None] >> np.arange(LANES)[None] // CORNERS_PER_TAG & 1).astype(np.float64)
-"""(16, LANES): for four bits of a visibility row, 1.0 for every corner of the tags seen; a block holds four tags."""
 
 
 class SphereTables(NamedTuple):
@@ -122,9 +120,13 @@ def write_weights(
         tag = np.uint64(4 * block)
         four_tags = (tables.sure[cell, tag >> np.uint64(6)] >> (tag & np.uint64(63))) & np.uint64(15)
         start, first = np.uint64((4 * block + slot) * LANES), np.uint64(block * LANES)
-        for index in range(LANES):
-            lane = np.uint64(index)
-            weights[start + lane] = sign * SEEN[four_tags, lane] * tables.weight[row, first + lane]
+        for corner in range(0, LANES, CORNERS_PER_TAG):
+            seen = sign if (four_tags >> np.uint64(corner // CORNERS_PER_TAG)) & np.uint64(1) else 0.0
+            to, of = start + np.uint64(corner), first + np.uint64(corner)
+            weights[to] = seen * tables.weight[row, of]
+            weights[to + np.uint64(1)] = seen * tables.weight[row, of + np.uint64(1)]
+            weights[to + np.uint64(2)] = seen * tables.weight[row, of + np.uint64(2)]
+            weights[to + np.uint64(3)] = seen * tables.weight[row, of + np.uint64(3)]
 
 
 @njit(cache=True, error_model="numpy")

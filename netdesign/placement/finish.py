@@ -144,7 +144,11 @@ def predicted(
     sigma = sighting_sigma(task.camera, world_from_cam, task.scene.targets)
     covariance = limited_covariance(world_from_cam, points, intrinsics, visible, sigma)
     limited = PointPrecision(covariance=covariance, rays=rays, propagation="limited", datum=LIMITED_DATUM)
-    total = total_covariance(world_from_cam, points, intrinsics, visible, sigma)
+    stations = [str(number + 1) for number in range(len(world_from_cam))]  # in visiting order, as the report counts
+    names = task.scene.targets.point_ids
+    total = total_covariance(
+        world_from_cam, points, intrinsics, visible, sigma, image_names=stations, point_names=names
+    )
     return limited, total.precision if total.determined else None, total.diagnosis
 
 

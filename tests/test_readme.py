@@ -44,7 +44,8 @@ def test_make_targets_exist(command):
 
 
 def test_make_demo_runs_the_quick_study():
-    done = subprocess.run(["make", "-n", "demo"], cwd=ROOT, capture_output=True, text=True, check=True)
+    plan = ["make", "--no-print-directory", "-n", "demo"]
+    done = subprocess.run(plan, cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.rstrip().endswith("netdesign run datasets/studies/quick.toml")
 
 

@@ -125,16 +125,28 @@ def calibrate_noise(
     if not usable:
         raise InputError("calibrate-noise: expected tags to be found on the grid, found none: too much blur or noise")
     k = float(np.exp(np.mean([np.log(cell.noise_px / cell.shape_px) for cell in usable])))
-    floor = float(np.sqrt(np.mean([cell.systematic_px**2 for cell in usable])))
+    noise = np.array([k * cell.shape_px for cell in usable])
+    total = np.hypot([cell.noise_px for cell in usable], [cell.systematic_px for cell in usable])
+    floor = _floor(noise, total)
     finished = [replace(cell, nees=_nees(errors, covariances, floor)) for cell, errors, covariances in results]
-    total = [np.hypot(cell.noise_px, cell.systematic_px) for cell in finished]
+    measured = [np.hypot(cell.noise_px, cell.systematic_px) for cell in finished]
     predicted = [np.hypot(k * cell.shape_px, floor) for cell in finished]
     return NoiseCalibration(
         noise=CornerNoise(k=k, floor_px=floor),
         cells=tuple(finished),
-        ratios=tuple(float(a / b) for a, b in zip(total, predicted, strict=True)),
+        ratios=tuple(float(a / b) for a, b in zip(measured, predicted, strict=True)),
         warnings=tuple(_warnings(finished)),
     )
+
+
+def _floor(noise: Floats, total: Floats) -> float:
+    """Return the floor (px) with which the predicted sigma is nearest, in ratio, to the total measured ones.
+
+    A mean of the systematic parts would be that of the small tags, where noise hides it, and spoil the large ones.
+    """
+    candidates = np.linspace(0.0, float(total.max()), 2001)
+    ratio = np.log(np.hypot(noise, candidates[:, None]) / total)
+    return float(candidates[np.square(ratio).sum(axis=1).argmin()])
 
 
 def write_calibration(path: Path, found: NoiseCalibration, camera: Camera, shoot: Shoot) -> None:

@@ -1,6 +1,6 @@
 """Measures what the imaging chain can and cannot do; writes results.json and the tables of README.md.
 
-    python validation/imaging/run.py [pipeline] [mismatch] [throughput] [detectors]
+    python validation/imaging/run.py [pipeline] [mismatch] [throughput] [detectors] [false_ids] [prediction]
 
 Without a name everything is measured (some ten minutes on two cores). The pictures share no
 sampling or blur code with the fit.
@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from netdesign.calibrate import calibrate_noise
 from netdesign.files.noise import read_corner_noise
 from netdesign.files.parts import load_part, load_targets
 from netdesign.files.store import plain
@@ -285,6 +286,47 @@ def detectors():
     }
 
 
+def false_ids():
+    """Ids that nobody put there, in 2000 pictures of tags without a list of the ids that may occur."""
+    scene = polyhedron()
+    poses = stations(10, 77, 0.45, 0.7)
+    visible = sightings(scene, CAMERA, poses, LIMITS).visible_tags
+    photographer, known = Photographer(scene, CAMERA, Shoot(seed=13, supersample=2)), set(scene.targets.ids.tolist())
+    pictures, found, false = 0, 0, 0
+    for index, pose in enumerate(poses):
+        light = photographer.light(pose)
+        for repeat in range(15):
+            seen = detect(photographer.expose(light, CAMERA, photographer.shoot, 100 * index + repeat), "tag36h11")
+            pictures += int(visible[index].sum())
+            found += len(seen)
+            false += sum(tag.tag_id not in known for tag in seen)
+    return {"tag_pictures": pictures, "recognised": found, "false_ids": false}
+
+
+def prediction():
+    """Measured corner sigma over the closed form's with the shipped k and floor, for other blurs and sensors."""
+    shipped, rows = read_corner_noise(None), []
+    with worker_pool(2) as executor:
+        for blur, well in ((0.5, 1500.0), (1.0, 1500.0), (1.3, 1500.0), (0.7, 600.0), (0.7, 6000.0)):
+            camera = replace(CAMERA, blur_px=blur, full_well_e=well)
+            found = calibrate_noise(
+                camera, Shoot(seed=17), sides_px=(25.0, 50.0, 100.0), incidences_deg=(0.0, 35.0, 60.0), replicates=5,
+                executor=executor,
+            )  # fmt: skip
+            for cell in found.cells:
+                predicted = np.hypot(shipped.k * cell.shape_px, shipped.floor_px)
+                rows.append({
+                    "blur_px": blur, "full_well_e": well, "side_px": cell.side_px, "incidence_deg": cell.incidence_deg,
+                    "tags": cell.tags, "missed": cell.missed, "rejected": cell.rejected, "nees_per_8": cell.nees,
+                    "measured_over_predicted": float(np.hypot(cell.noise_px, cell.systematic_px) / predicted),
+                })  # fmt: skip
+    ratios = np.array([row["measured_over_predicted"] for row in rows if row["tags"] >= 20])
+    return {
+        "cells": rows, "judged": len(ratios), "lowest": float(ratios.min()), "highest": float(ratios.max()),
+        "median_deviation": float(np.median(np.abs(ratios - 1))),
+    }  # fmt: skip
+
+
 def table(rows):
     """Return the mismatch rows as a Markdown table."""
     titles = (
@@ -309,7 +351,10 @@ def main():
     """Measure what is asked for and renew the files."""
     path = HERE / "results.json"
     results = json.loads(path.read_text()) if path.is_file() else {}
-    measures = {"pipeline": pipeline, "mismatch": mismatch, "throughput": throughput, "detectors": detectors}
+    measures = {
+        "pipeline": pipeline, "mismatch": mismatch, "throughput": throughput, "detectors": detectors,
+        "false_ids": false_ids, "prediction": prediction,
+    }  # fmt: skip
     for name in sys.argv[1:] or measures:
         results[name] = plain(measures[name]())
         print(name, json.dumps(results[name], indent=1))

@@ -4,7 +4,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
@@ -13,9 +13,8 @@ from netdesign.errors import InputError, NetdesignError
 if TYPE_CHECKING:
     from netdesign.terminal import TerminalProgress
 
-# Typer brings its own click along, or takes the installed one: the classes are found from what it exports.
-UsageProblem = typer.BadParameter.__mro__[1]
-CommandProblem = typer.BadParameter.__mro__[2]
+# Typer brings its own click along, or takes the installed one: the class is found from what it exports.
+CommandProblem = cast(type[Exception], typer.BadParameter.__mro__[2])
 
 app = typer.Typer(
     name="netdesign",
@@ -252,14 +251,15 @@ def main() -> None:
     """Run the command line and leave with the exit status of the contract."""
     try:
         app(standalone_mode=False)
-    except CommandProblem as error:
+    except CommandProblem as problem:
+        error: Any = problem
         message = " ".join(str(error.format_message()).split())
-        if type(error).__name__ == "NoArgsIsHelpError":
-            _complain(error.message, 2)
-        context = getattr(error, "ctx", None)
+        if type(problem).__name__ == "NoArgsIsHelpError":
+            _complain(str(error.message), 2)
+        context = getattr(problem, "ctx", None)
         _complain(f"{context.command_path if context else 'netdesign'}: {message}", 2)
-    except NetdesignError as error:
-        _complain(f"netdesign: {error}", error.exit_status)
+    except NetdesignError as refusal:
+        _complain(f"netdesign: {refusal}", refusal.exit_status)
     except (KeyboardInterrupt, typer.Abort):
         _complain("netdesign: interrupted, what is done is kept", 130)
     except BrokenPipeError:  # the reader of our output has seen enough

@@ -104,7 +104,7 @@ def test_one_or_two_threads_the_same_bytes(run, tmp_path):
     ("old", "new", "status", "says"),
     [
         ("min_rays", "", 3, "robot"),
-        ("max_incidence_deg", "max_incidence_deg = 2", 3, "seen"),
+        ("max_incidence_deg", "max_incidence_deg = 2", 3, "no viewpoint sees"),
         ("too few", "min_rays = 3", 3, "max_images"),
     ],
     ids=["out of reach", "seen by nobody", "too few images"],

@@ -128,9 +128,9 @@ def load_task(path: Path, seed: int | None = None) -> Task:
         rotation_from_rpy(np.radians(part_table.rotation_deg)), np.array(part_table.position_mm) * MM
     )
     part = load_part(_beside(path, part_table.mesh), part_table.unit, world_from_mesh)
-    targets = _targets(study, path, part, world_from_mesh)
     sphere = _sphere(study.viewpoints)
-    _check_clearance(part, sphere, part_table, path)
+    _check_clearance(part, sphere, part_table, path)  # before tags are spread over a part in the wrong unit
+    targets = _targets(study, path, part, world_from_mesh)
     return Task(
         study=resolved.study,
         scene=Scene(part=part, targets=targets),

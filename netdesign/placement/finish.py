@@ -100,11 +100,10 @@ class Exact:
         limited, total, complaints = predicted(task, world_from_cam, visible, rays)
         if not np.isfinite(limited.covariance).all():
             return "a point whose rays are parallel"
-        precision = limited
-        if task.study.objectives.propagation == "total":
-            if total is None:
-                return "not determined in total error propagation"
-            precision = total
+        # Limited propagation is blind to images that hang together by too little: such a network has no accuracy.
+        if total is None:
+            return "not determined in total error propagation"
+        precision = total if task.study.objectives.propagation == "total" else limited
         worst = task.study.objectives.precision == "max_sigma"
         return DesignedNetwork(
             viewpoints=viewpoints,

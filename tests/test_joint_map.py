@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from netdesign.motion.collision import FREE, REASONS, states
-from netdesign.motion.joint_map import JointMap, options_at, solve_closed
+from netdesign.motion.joint_lookup import options_at
+from netdesign.motion.joint_map import JointMap, solve_closed
 from netdesign.motion.kinematics import into_limits
 from netdesign.motion.plan import plan_on
 from tests.cells import PART, arm, cell, joint_map, reachable_viewpoints, viewpoints

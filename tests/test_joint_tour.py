@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from netdesign.motion.exact_tour import exact_joint_tour
-from netdesign.motion.joint_tour import choose_options, directions_tour, joint_tour, law_of, network_tour, scratch
+from netdesign.motion.joint_tour import (
+    NO_TURN,
+    choose_options,
+    directions_tour,
+    joint_tour,
+    law_of,
+    network_tour,
+    scratch,
+)
 from netdesign.motion.timing import leg_time
 from tests.cells import joint_map, reachable_viewpoints
 
@@ -22,7 +30,7 @@ def instance(n, seed, most=4):
 
 def leg(a, b, law, timed):
     d = np.abs(a - b)
-    d = np.where(law[3] > 0, np.minimum(d, 2 * np.pi - d), d)
+    d = np.where(law[3] < NO_TURN, np.minimum(d, 2 * np.pi - d), d)
     if timed:
         return leg_time(np.zeros(6), d, 1 / law[1], 1 / law[2])
     return np.linalg.norm(law[0] * d)
@@ -33,7 +41,7 @@ def some_law():
     law[0] = [1, 2, 1, 0.5, 1, 1]
     law[1], law[2] = 1 / 1.05, 1 / 1.4
     law[3] = 2 * np.pi
-    law[3, 2] = 0.0
+    law[3, 2] = NO_TURN
     return law
 
 

@@ -13,7 +13,7 @@ Disc coordinates of a unit direction u: (ux, uy) sqrt(2 / (1 + uz)); the disc of
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -25,32 +25,18 @@ from netdesign.model.scene import Part
 from netdesign.model.task import RobotCell, ViewingSphere
 from netdesign.motion.cell import ArmCell, load_arm
 from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION, REASONS, configuration_state
+from netdesign.motion.joint_lookup import MapArrays, options_at
 from netdesign.motion.joint_sheets import sheets
 from netdesign.motion.kinematics import into_limits
 from netdesign.motion.stored import Arrays, content_key, stored
 from netdesign.motion.ur_kinematics import BRANCHES, ur_branches
 
-_VERSION = 1
+_VERSION = 2
 SEARCH_ROLLS = 12
 _GRID_CLOSED = {1: 128, SEARCH_ROLLS: 64}
 _GRID_SHEETS = {1: 64, SEARCH_ROLLS: 36}
 # Neighbouring nodes whose joints differ by more belong to different sheets, or to a singularity.
 _LARGEST_JUMP = 0.8
-
-
-class MapArrays(NamedTuple):
-    """The map as the kernels take it.
-
-    joints (R, G, G, B, r) float32 rad; state (R, G, G, B) int8; half: disc coordinate of the last node; labels (B,):
-    branches, the one with the most free nodes first; most: options a lookup can return.
-    """
-
-    joints: NDArray[np.float32]
-    state: NDArray[np.int8]
-    half: float
-    labels: Ints
-    wraps: Bools
-    most: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +88,9 @@ class JointMap:
         free = (kept["state"] == FREE).sum(axis=(0, 1, 2))
         labels = np.argsort(-free, kind="stable").astype(np.int64)
         most = len(labels) if count == 1 else count
-        arrays = MapArrays(kept["joints"], kept["state"], half, labels, np.array(arm.placed.wraps), most)
+        arrays = MapArrays(
+            kept["joints"], kept["state"], kept["usable"], half, labels, np.array(arm.placed.wraps), most
+        )
         return cls(arm=arm, sphere=sphere, arrays=arrays, rolls=angles, follows=follows)
 
     def options(self, viewpoints: Floats) -> tuple[Floats, Ints]:
@@ -207,7 +195,20 @@ def _fill(arm: ArmCell, targets: Floats, follows: bool) -> Arrays:
     count, r = found.shape[-1], solved.shape[-1]
     rest = _rest(arm) if follows else math.nan
     state = _states_of(arm.body, arm.placed.lower, arm.placed.upper, solved.reshape(-1, r), found.reshape(-1), rest)
-    return {"joints": solved.astype(np.float32), "state": state.reshape(*shape, count)}
+    joints, state = solved.astype(np.float32), state.reshape(*shape, count)
+    return {"joints": joints, "state": state, "usable": _usable(joints, state, np.array(arm.placed.wraps))}
+
+
+def _usable(joints: NDArray[np.float32], state: NDArray[np.int8], wraps: Bools) -> NDArray[np.uint16]:
+    """Return the cells (R, G - 1, G - 1) with a bit for every branch that can be interpolated in them."""
+    corners = [(slice(i, i - 1 or None), slice(j, j - 1 or None)) for i, j in ((0, 0), (1, 0), (0, 1), (1, 1))]
+    good = np.logical_and.reduce([state[:, i, j] == FREE for i, j in corners])
+    for i, j in corners[1:]:
+        change = joints[:, i, j] - joints[:, :-1, :-1]
+        change -= np.where(wraps, 2.0 * np.pi * np.rint(change / (2.0 * np.pi)), 0.0)
+        good &= np.abs(change).max(axis=-1) <= _LARGEST_JUMP
+    bits = np.left_shift(1, np.arange(good.shape[-1]), dtype=np.int64)
+    return np.asarray((good * bits).sum(axis=-1), dtype=np.uint16)
 
 
 def solve_closed(arm: ArmCell, targets: Floats) -> tuple[Floats, Bools]:
@@ -250,51 +251,3 @@ def _states_of(body, lower, upper, joints, found, rest):  # type: ignore[no-unty
         else:
             state[i] = LIMITS
     return state
-
-
-@njit(cache=True, error_model="numpy")
-def options_at(arrays, alpha, beta, out):  # type: ignore[no-untyped-def]
-    """Write the free options of a viewing direction into out (r, K), option by column; return how many there are.
-
-    With one roll every branch is an option. With more, every roll of the first label that has one: one branch for a
-    whole tour costs little, and the search stays cheap (robot notes, section 2).
-    """
-    rolls, size, branches, r = (
-        arrays.state.shape[0], arrays.state.shape[1], arrays.state.shape[3], arrays.joints.shape[4],
-    )  # fmt: skip
-    radius = 2.0 * math.sin(0.25 * math.pi - 0.5 * beta)
-    x = (radius * math.cos(alpha) / arrays.half + 1.0) * 0.5 * (size - 1)
-    y = (radius * math.sin(alpha) / arrays.half + 1.0) * 0.5 * (size - 1)
-    i, j = int(x), int(y)
-    if x < 0.0 or y < 0.0 or i > size - 2 or j > size - 2:
-        return 0
-    u, v = x - i, y - j
-    turn = 2.0 * math.pi
-    count = 0
-    for position in range(branches):
-        b = arrays.labels[position]
-        for k in range(rolls):
-            s = arrays.state
-            if s[k, i, j, b] or s[k, i + 1, j, b] or s[k, i, j + 1, b] or s[k, i + 1, j + 1, b]:
-                continue
-            smooth = True
-            for a in range(r):
-                q0 = float(arrays.joints[k, i, j, b, a])
-                d1 = float(arrays.joints[k, i + 1, j, b, a]) - q0
-                d2 = float(arrays.joints[k, i, j + 1, b, a]) - q0
-                d3 = float(arrays.joints[k, i + 1, j + 1, b, a]) - q0
-                if arrays.wraps[a]:
-                    d1 -= turn * math.floor(d1 / turn + 0.5)
-                    d2 -= turn * math.floor(d2 / turn + 0.5)
-                    d3 -= turn * math.floor(d3 / turn + 0.5)
-                if abs(d1) > _LARGEST_JUMP or abs(d2) > _LARGEST_JUMP or abs(d3) > _LARGEST_JUMP:
-                    smooth = False
-                    break
-                out[a, count] = q0 + u * (1.0 - v) * d1 + (1.0 - u) * v * d2 + u * v * d3
-            if smooth:
-                count += 1
-                if count == out.shape[1]:
-                    return count
-        if rolls > 1 and count:
-            return count
-    return count

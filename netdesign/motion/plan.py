@@ -20,7 +20,7 @@ from netdesign.model.scene import Part
 from netdesign.model.task import RobotCell, ViewingSphere
 from netdesign.motion.exact_tour import exact_joint_tour
 from netdesign.motion.joint_map import JointMap
-from netdesign.motion.joint_tour import directions_tour, joint_tour, law_of, legs_from, scratch
+from netdesign.motion.joint_tour import NO_TURN, directions_tour, joint_tour, law_of, legs_from, scratch
 from netdesign.motion.kinematics import forward
 from netdesign.motion.legs import Legs
 from netdesign.motion.options import StationOptions, exact_options, lifted
@@ -139,7 +139,7 @@ def tour_length(joints: Floats, vias: dict[int, Floats], law: Floats, timed: boo
 def _plain(law: Floats) -> Floats:
     """Return the law without wrapping: differences as they are driven."""
     flat = law.copy()
-    flat[3] = 0.0
+    flat[3] = NO_TURN
     return flat
 
 

@@ -67,6 +67,31 @@ def test_rendered_and_detected_tags_lie_where_they_are_projected(renderer):
     np.testing.assert_allclose([tag.corners_px for tag in measured], CORNERS_PX, atol=0.02)
 
 
+@pytest.mark.parametrize("make", [lambda s, c: Renderer(s, c, 4), ReferenceRenderer], ids=["pyrender", "reference"])
+def test_every_tag_centre_that_opencv_finds_lies_within_a_fiftieth_of_a_pixel(make):
+    # Large tags and a window of a third of a cell: OpenCV's own best, with nothing of ours but the picture.
+    lens = replace(
+        LENS, width_px=1600, height_px=1200, focal_px=np.array([3000.0, 3010.0]),
+        principal_point_px=np.array([798.7, 601.2]),
+    )  # fmt: skip
+    scene = plate_scene(side=3, spacing=0.055, tag_size=0.03)
+    settings = cv2.aruco.DetectorParameters()
+    settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    settings.cornerRefinementWinSize = 8
+    settings.relativeCornerRefinmentWinSize = 0.9
+    settings.cornerRefinementMaxIterations = 100
+    settings.cornerRefinementMinAccuracy = 1e-4
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), settings)
+    renderer = make(scene, lens)
+    for elevation, roll in ((75.0, 0.35), (60.0, 1.0)):
+        pose = look_at(0.45 * sphere_directions(np.radians([20.0, elevation])), np.zeros(3), roll)
+        centres = project(pose, scene.targets.points, lens.intrinsics)[0].reshape(-1, 4, 2).mean(axis=1)
+        corners, ids, _ = detector.detectMarkers(expose(renderer.render(inverse(pose)), lens, None))
+        assert len(ids) >= 8
+        found = np.array([corner.reshape(4, 2).mean(axis=0) for corner in corners])
+        np.testing.assert_allclose(found, centres[ids.ravel()], atol=0.02)
+
+
 def test_pose_from_a_tag_is_the_camera_that_saw_it():
     targets = SCENE.targets
     up = np.cross(targets.normals, targets.x_axes)

@@ -164,7 +164,8 @@ def _adjusted(task: Task, network: PlannedNetwork, observations: Observations, n
         image_names=names,
         point_names=task.scene.targets.point_ids,
     )
-    return replace(adjustment, rejected=cleaned.rejected)
+    # Only the first adjustment knows which points lost their rays to its outlier test.
+    return replace(adjustment, rejected=cleaned.rejected, warnings=cleaned.warnings)
 
 
 def _gates(task: Task) -> Gates:

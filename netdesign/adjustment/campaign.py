@@ -241,13 +241,33 @@ def _repeats(members: Sequence[Member]) -> dict[str, Repeats]:
 
 
 def _statement(count: int, rho: Band, root_f: Band) -> str:
-    """Return the verdict in one sentence."""
-    verdict = "is" if rho.equivalent and root_f.equivalent else "is not"
+    """Return the verdict in words: shown, refuted, or what it would take to decide."""
+    tested = (rho, root_f)
+    if all(band.equivalent for band in tested):
+        verdict = "is shown to be the achieved one."
+    elif any(band.high < band.margin[0] or band.low > band.margin[1] for band in tested):
+        verdict = "is not the achieved one: an interval lies wholly outside its margin."
+    elif all(band.margin[0] < band.value < band.margin[1] for band in tested):
+        needed = max(_realisations_needed(band, count) for band in tested if not band.equivalent)
+        verdict = (
+            "is not shown to be the achieved one yet: nothing speaks against it, but so few leave the interval too "
+            f"wide. About {needed} would decide ([validation] repeats)."
+        )
+    else:
+        verdict = "is not shown to be the achieved one."
     bands = [
         f"{band.value:.3f} [{band.low:.3f}, {band.high:.3f}] against [{band.margin[0]:.2f}, {band.margin[1]:.2f}]"
         for band in (rho, root_f)
     ]
     return (
-        f"Over {count} realisation(s) the predicted accuracy {verdict} shown to be the achieved one. "
+        f"Over {count} realisation(s) the predicted accuracy {verdict} "
         f"With 90 % intervals: achieved / predicted {bands[0]}; geometry alone, sqrt(F), {bands[1]}."
     )
+
+
+def _realisations_needed(band: Band, count: int) -> int:
+    """Return how many realisations would narrow the interval enough if the value stayed: its width falls as 1/√n."""
+    value, low, high = np.log([band.value, band.low, band.high])
+    inner, outer = np.log(band.margin)
+    widest = max((value - low) / (value - inner), (high - value) / (outer - value))
+    return int(np.ceil(count * widest**2))

@@ -14,6 +14,8 @@ POINT_CONDITION = 1e-9  # of a point's normals: below it its rays are parallel
 HOPELESS_DEPTH = 0.2  # sigma over distance above which a point counts as not determined
 WEAK_DEPTH = 0.01  # sigma over distance above which its ray geometry is named; many such points are a broken network
 WEAK_SHARE = 0.1
+HARDLY_CHECKED = 0.1  # redundancy number below which a gross error hardly shows in the residual
+SHARE_HARDLY_CHECKED = 0.05  # of the image points; a few at the end of a three-ray point are in every network
 CLOSE_BASELINE = 0.01
 CORRELATION = 0.95
 NOT_DETERMINED = 200.0  # effect of a parameter's sigma in the image, in sigmas of one image coordinate
@@ -180,9 +182,10 @@ def quality_warnings(
     if weak.any():
         text = f"{int(weak.sum())} point(s) are seen under so small an angle that their distance is known to 1 % only"
         warnings.append(f"{text}: {listed(named(names, weak))}")
-    low = adjustment.redundancy_numbers.min(axis=1) < 0.1
-    if low.any():
-        warnings.append(f"{int(low.sum())} image point(s) have a redundancy number below 0.1: hardly checked")
+    low = adjustment.redundancy_numbers.min(axis=1) < HARDLY_CHECKED
+    if low.mean() > SHARE_HARDLY_CHECKED:
+        share = f"{int(low.sum())} of {len(low)} image points have a redundancy number below {HARDLY_CHECKED}"
+        warnings.append(f"{share}: a gross error in them would hardly show")
     warnings.extend(tie_flags(problem.visible(), problem.image_names) if not problem.known().any() else ())
     warnings.extend(_variance_warning(adjustment))
     warnings.extend(_correlations(problem, adjustment))

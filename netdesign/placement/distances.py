@@ -20,7 +20,11 @@ def network_total_error(task: Task, world_from_cam: Floats, visible: Bools | Non
     if visible is None:
         visible = sightings(task.scene, task.camera, world_from_cam, task.limits).visible
     sigma = sighting_sigma(task.camera, world_from_cam, task.scene.targets)
-    return total_covariance(world_from_cam, task.scene.targets.points, task.camera.intrinsics, visible, sigma)
+    targets, stations = task.scene.targets, [str(number + 1) for number in range(len(world_from_cam))]
+    return total_covariance(
+        world_from_cam, targets.points, task.camera.intrinsics, visible, sigma,
+        image_names=stations, point_names=targets.point_ids,
+    )  # fmt: skip
 
 
 def distance_u95(task: Task, world_from_cam: Floats, ends: Ints) -> Floats:

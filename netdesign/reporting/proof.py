@@ -112,7 +112,7 @@ def campaign(record: RunRecord) -> Values | None:
         verdicts.append({"kind": "warn", "text": f"Not validated yet: {counted} of {len(record.networks)} networks."})
     return {
         "lead": f"{len(validated)} of {len(record.networks)} networks of the front were rendered, measured and "
-        "adjusted. One network alone cannot confirm a prediction to ten per cent; all of them together can.",
+        "adjusted. One network alone cannot confirm a prediction to ten per cent; many together can.",
         "verdicts": verdicts,
         "pooled": charts.interval_chart(interval_rows(content.get("statistics", {})), "99 %"),
         "pooled_caption": "All networks as one: T, s0² and F from summed squares, each in its exact 99 % interval.",

@@ -9,11 +9,10 @@ can give, T = Σ_j tr Z_j, and the best common scale of the Z_j,
 
     f1 >= T² / (3 m k H)      for every network of k admissible images.
 
-Good Z_j come from the continuous relaxation: weights of candidate viewpoints that minimise Σ_j tr(N_j⁻¹) (A-optimality,
-solved by the multiplicative algorithm: Y. Yu, Annals of Statistics 38(3), 2010), Z_j = N_j⁻¹ at the solution; there the
-bound is sharp. They need not be optimal for the bound to hold. H is proved cell by cell over the whole sphere
-(``information``): a tag counts as seen where the visibility map cannot exclude it, every cell by its best viewpoint.
-Cells that stand out become candidates and the weights are solved again.
+Good Z_j come from the continuous relaxation (``optimal_design``), Z_j = N_j⁻¹ at its solution; there it is sharp.
+They need not be optimal for the bound to hold. H is proved cell by cell over the whole sphere (``information``): a tag
+counts as seen where the visibility map cannot exclude it, every cell by its best viewpoint. Cells that stand out become
+candidates and the weights are solved again.
 
 The closed form 1.5 sigma² / Σ S⁻² per point is the special case of isotropic Z_j with every point's own best
 viewpoints; the relaxation, which has to share its viewpoints among the points, is never weaker.
@@ -33,12 +32,12 @@ from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.photogrammetry.precision import corner_sigma
 from netdesign.placement.information import largest_gains, normal_matrices, quadratic_forms
+from netdesign.placement.optimal_design import inverses, optimal_weights
 from netdesign.placement.visibility_cells import Words
 from netdesign.placement.visibility_map import VisibilityMap, field_bounds, spread_angle
 
 CANDIDATE_STEP = np.radians(4.0)
 ROUNDS = 10
-ITERATIONS = 400
 SHY = 20  # tags seen by fewer candidates get candidates of their own
 # Stop when the bound is this close to the relaxation's own value.
 TOLERANCE = 4e-3
@@ -106,9 +105,9 @@ def information_limit(task: Task, visibility_map: VisibilityMap) -> float | None
     sparse = seen[(row % 2 == 0) & (column % 2 == 0)]
     lookout, last, best = sparse, np.inf, 0.0
     for _ in range(ROUNDS):
-        keep, weights = _solve(flat, weights)
+        keep, weights = optimal_weights(flat, weights)
         flat, candidates = flat[keep], candidates[keep]
-        inverse = _inverse(flat, weights)
+        inverse = inverses(flat, weights)
         trace = float(np.trace(inverse, axis1=1, axis2=2).sum())
         heights = views.largest(lookout, inverse)
         gap = float(heights.max(initial=trace)) / trace - 1.0
@@ -199,37 +198,6 @@ def _candidates(visibility_map: VisibilityMap, seen: Ints) -> Ints:
         cells = seen[views != 0]
         chosen = np.concatenate([chosen, cells[np.linspace(0, len(cells) - 1, min(SHY, len(cells))).astype(int)]])
     return np.unique(chosen)
-
-
-def _inverse(flat: Floats, weights: Floats) -> Floats:
-    """(m, 3, 3) inverses of Σ_i w_i M_ij for flattened matrices (c, 6 m)."""
-    summed = (weights @ flat).reshape(-1, 6)
-    normal = summed[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-    # A point with nearly parallel rays only: its Z need not be exact.
-    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    return np.asarray(np.linalg.inv(normal), dtype=np.float64)
-
-
-def _solve(flat: Floats, weights: Floats) -> tuple[Ints, Floats]:
-    """Improve ``weights`` (c,) of candidates with matrices (c, 6 m); return those that still matter, and their weights.
-
-    Multiplicative algorithm: w_i grows with a power of h(v_i) over the weighted mean of h; at the optimum h is the
-    mean where w > 0 and smaller elsewhere. (The exponent 1/2 is proved to converge, 0.8 is faster here.)
-    """
-    active = np.arange(len(weights))
-    for iteration in range(ITERATIONS):
-        inverse = _inverse(flat, weights)
-        square = (inverse @ inverse)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]] * [1.0, 2, 2, 1, 2, 1]
-        height = flat @ square.ravel()
-        mean = float(weights @ height)
-        if height.max() <= (1.0 + 0.25 * TOLERANCE) * mean:
-            break
-        weights = weights * (height / mean) ** 0.8
-        weights /= weights.sum()
-        if iteration % 25 == 24:
-            keep = weights > 1e-2 / len(weights)
-            active, flat, weights = active[keep], flat[keep], weights[keep] / weights[keep].sum()
-    return active, weights
 
 
 def _refined(views: _Views, seen: Ints, heights: Floats, inverse: Floats, trace: float) -> float:

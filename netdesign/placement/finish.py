@@ -28,6 +28,7 @@ from netdesign.search.archive import non_dominated
 from netdesign.search.state import State
 
 LIMITED_DATUM = "fixed: the poses are error-free"
+COARSE = 25.0  # times the smallest f1 of a front: five times its sigma
 SPARE = 1.5  # networks computed exactly per network kept: some fall to exact rays or to domination
 
 
@@ -70,7 +71,7 @@ def finish(problem: Problem, state: State, progress: Progress = silent) -> Desig
         networks=tuple(_bounded(networks[row], bounds) for row in kept.tolist()),
         history=SearchHistory(evaluations=state.evaluations, hypervolume=state.hypervolume),
         bounds=bounds,
-        notes=tuple(_notes(problem, dropped)),
+        notes=tuple(_notes(problem, [networks[row] for row in kept.tolist()], dropped)),
     )
 
 
@@ -152,41 +153,31 @@ def predicted(
 
 
 def spread(objectives: Floats, most: int) -> Ints:
-    """Return at most ``most`` rows of a front (N, 3), ascending: every size keeps its ends, the rest is spread evenly.
+    """Return at most ``most`` rows of a front (N, 3), ascending, that stand for all of it.
 
-    Sizes share the places in turn, so that a size with few networks keeps all of them; within a size, places go along
-    the staircase at equal steps of log f1 and f2, both scaled to the size's own range.
+    First the most precise network of every size (of sizes evenly chosen when there are too many), then the one with the
+    shortest tour, then always the network farthest from the chosen ones in log f1, f2 and f3, scaled to their ranges.
+    Networks of more than COARSE times the smallest f1 buy a short tour with next to no precision: they come last.
     """
     if len(objectives) <= most:
         return np.arange(len(objectives))
-    sizes = np.unique(objectives[:, 2])
-    layers = [np.flatnonzero(objectives[:, 2] == size) for size in sizes]
-    places = np.zeros(len(layers), dtype=np.int64)
-    for turn in range(max(len(layer) for layer in layers)):
-        for index, layer in enumerate(layers):
-            if places.sum() < most and len(layer) > turn:
-                places[index] += 1
-    chosen = [layer[_along(objectives[layer], int(places[index]))] for index, layer in enumerate(layers)]
-    return np.sort(np.concatenate(chosen))
-
-
-def _along(objectives: Floats, count: int) -> Ints:
-    """``count`` rows of one staircase, its ends first, then at equal arc lengths."""
-    if count >= len(objectives):
-        return np.arange(len(objectives))
-    if count <= 0:
-        return np.zeros(0, dtype=np.int64)
-    order = np.argsort(objectives[:, 0], kind="stable")
-    curve = np.stack([np.log(objectives[order, 0]), objectives[order, 1]], axis=1)
-    curve = (curve - curve.min(axis=0)) / np.maximum(np.ptp(curve, axis=0), 1e-300)
-    if count == 1:
-        return order[[int(np.argmin((curve**2).sum(axis=1)))]]
-    length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
-    chosen: list[int] = []
-    for goal in np.linspace(0.0, length[-1], count):
-        nearest = np.argsort(np.abs(length - goal), kind="stable")
-        chosen.append(next(row for row in nearest.tolist() if row not in chosen))
-    return order[chosen]
+    f1, f2, f3 = np.maximum(objectives.T, 1e-300)
+    sizes = np.unique(f3)
+    sizes = sizes[np.unique(np.round(np.linspace(0, len(sizes) - 1, min(most, len(sizes)))).astype(np.int64))]
+    chosen = [int(np.argmin(np.where(f3 == size, f1, np.inf))) for size in sizes]
+    good = f1 <= COARSE * f1.min()
+    shortest = int(np.argmin(np.where(good, f2, np.inf)))
+    if len(chosen) < most and shortest not in chosen:
+        chosen.append(shortest)
+    places = np.column_stack([np.log(f1), f2, f3])
+    places = (places - places[good].min(axis=0)) / np.maximum(np.ptp(places[good], axis=0), 1e-300)
+    distance = np.linalg.norm(places[:, None] - places[None, chosen], axis=2).min(axis=1)
+    while len(chosen) < most:
+        distance[chosen] = -1.0
+        open_to_choice = good & (distance >= 0.0)
+        chosen.append(int(np.argmax(np.where(open_to_choice, distance, -1.0) if open_to_choice.any() else distance)))
+        distance = np.minimum(distance, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    return np.sort(np.array(chosen, dtype=np.int64))
 
 
 def _bounded(network: DesignedNetwork, bounds: dict[int, float]) -> DesignedNetwork:
@@ -201,14 +192,18 @@ def _counts(dropped: Counter[str]) -> str:
     return ", ".join(f"{count} with {reason}" for reason, count in sorted(dropped.items()) if count)
 
 
-def _notes(problem: Problem, dropped: Counter[str]) -> list[str]:
+def _notes(problem: Problem, networks: Sequence[DesignedNetwork], dropped: Counter[str]) -> list[str]:
     notes = []
     cover = problem.cover
-    if len(cover.viewpoints):
-        proved = "proved" if cover.least == len(cover.viewpoints) else f"at least {cover.least} proved"
+    size, fewest = len(cover.viewpoints), min(network.f3 for network in networks)
+    if size:
+        optimal = (
+            "no smaller choice of them does" if cover.least == size else f"of them at least {cover.least} are needed"
+        )
+        found = f"; the front goes down to {fewest}" if fewest < size else ""
         notes.append(
-            f"set cover: {len(cover.viewpoints)} images see every point {problem.task.limits.min_rays} times;"
-            f" the least number over {cover.candidates} candidate stations ({proved})"
+            f"set cover: {size} of {cover.candidates} candidate stations see every point"
+            f" {problem.task.limits.min_rays} times, {optimal}; stations between them may need fewer{found}"
         )
     if sum(dropped.values()):
         notes.append("left out of the front after the exact check: " + _counts(dropped))

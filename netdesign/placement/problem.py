@@ -23,7 +23,9 @@ from netdesign.placement.evaluation import (
     joint_tours,
 )
 from netdesign.placement.local_search import ADD, MOVE, REMOVE, Tries, improve_networks
+from netdesign.placement.optimal_design import information_of, rounded_networks
 from netdesign.placement.preparation import (
+    candidates,
     datum_gauge,
     demanded_cover,
     hypervolume_scale,
@@ -152,7 +154,33 @@ class Problem:
         return self.chromosomes.random(rng, count)
 
     def seeds(self) -> tuple[Bools, Floats]:
-        """Return the smallest cover, and larger networks that contain it: deterministic."""
+        """Return the rounded optimal design of every size, the smallest cover, and larger networks that contain it."""
+        slots = self.chromosomes.slots
+        designed = self._designed()
+        genes = np.zeros((len(designed), slots, 2))
+        for row, viewpoints in enumerate(designed):
+            genes[row, : len(viewpoints)] = self.chromosomes.folded(viewpoints)
+        bits = np.arange(slots) < np.array([len(viewpoints) for viewpoints in designed], np.int64)[:, None]
+        cover_bits, cover_genes = self._cover_seeds()
+        return np.concatenate([bits, cover_bits]), np.concatenate([genes, cover_genes])
+
+    def _designed(self) -> list[Floats]:
+        """Networks near the best f1 of every size from that of the cover on, of stations of the set cover's lattice."""
+        viewpoints, cells = candidates(self.task, self.visibility, self.joint_map, self.tables)
+        visible = np.repeat(self.visibility.sure_tags(cells), CORNERS_PER_TAG, axis=1)
+        flat = information_of(self.task, self.task.sphere.cameras(viewpoints), visible)
+        tables = self.tables._replace(in_joints=True)  # whatever the tour
+
+        def score(bits: Bools, genes: Floats) -> tuple[Floats, Floats]:
+            objectives, violation = np.empty((len(bits), 3)), np.empty(len(bits))
+            evaluate_networks(bits, np.ascontiguousarray(genes), tables, objectives, violation)
+            return objectives[:, 0], violation
+
+        first = max(len(self.cover.viewpoints), 2)
+        return rounded_networks(viewpoints, flat, range(first, self.chromosomes.slots + 1), score)
+
+    def _cover_seeds(self) -> tuple[Bools, Floats]:
+        """The smallest cover, and larger networks that contain it: deterministic."""
         size, slots = len(self.cover.viewpoints), self.chromosomes.slots
         if size == 0 or size > slots:
             return np.zeros((0, slots), np.bool_), np.zeros((0, slots, 2))

@@ -129,7 +129,8 @@ def is_proved(task: Task, network: PlannedNetwork, folder: Path) -> bool:
         record = read_json(folder / "validation.json", "network-validation")
     except InputError:
         return False
-    return bool(record.get("study_sha256") == task.sha256 and record.get("plan") == _plan_key(network))
+    complete = record.get("verdict") == "failed" or "log_rho_expected" in record  # absent in earlier versions
+    return bool(complete and record.get("study_sha256") == task.sha256 and record.get("plan") == _plan_key(network))
 
 
 def observations_csv(observations: Observations, names: list[str], point_ids: tuple[str, ...]) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 from netdesign.adjustment.campaign import pool
 from netdesign.cluster import executor_of
 from netdesign.files.adjustment import campaign_member, campaign_payload
-from netdesign.files.design_json import find_network, read_networks
+from netdesign.files.design_json import PlannedNetwork, find_network, read_networks
 from netdesign.files.store import read_json, write_json
 from netdesign.imageset import worker_pool
 from netdesign.imaging.photograph import RendererName
@@ -77,17 +77,17 @@ def validate_run(
                 if not is_proved(task, networks[number], folder):
                     prove_network(task, networks[number], folder, repeat, level, executor)
             progress("validate", done + 1, len(chosen), f"network {number}")
-    return _pool(task, run, sorted(networks))
+    return _pool(task, run, networks)
 
 
-def _pool(task: Task, run: Path, numbers: list[int]) -> ValidationOutcome:
+def _pool(task: Task, run: Path, networks: dict[int, PlannedNetwork]) -> ValidationOutcome:
     """Write RUN/validation.json from every network that is validated, the failed ones with their reasons."""
     records = []
-    for number in numbers:
+    for number, network in sorted(networks.items()):
         for repeat in range(task.study.validation.repeats):
-            path = network_folder(run, number, repeat) / "validation.json"
-            if path.is_file():
-                records.append(read_json(path, "network-validation"))
+            folder = network_folder(run, number, repeat)
+            if is_proved(task, network, folder):
+                records.append(read_json(folder / "validation.json", "network-validation"))
     adjusted = [record for record in records if record["verdict"] != "failed"]
     payload: dict[str, Any] = {"networks": [{key: record.get(key) for key in POOLED} for record in records]}
     statement = "no network could be adjusted"

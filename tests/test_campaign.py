@@ -8,6 +8,7 @@ from netdesign.adjustment.campaign import Member, member_of, pool
 from netdesign.adjustment.compare import compare
 from netdesign.adjustment.estimate import estimate
 from netdesign.adjustment.lengths import chosen_lengths, length_test, length_uncertainty
+from netdesign.adjustment.statistics import log_rms_moments
 from netdesign.errors import InfeasibleError
 from netdesign.files.adjustment import campaign_member, campaign_payload, length_payload, validation_payload
 from netdesign.files.store import plain
@@ -45,6 +46,7 @@ def test_right_predictions_are_equivalent(right):
     assert campaign.rho.low < 1 < campaign.rho.high
     assert 0.92 < campaign.coverage < 0.98
     assert campaign.against["used"] == pytest.approx(campaign.rho.value)
+    assert campaign.plain["used"] == pytest.approx(np.exp(np.mean(np.log([m.rho for m in right]))))
     assert "is shown to be" in campaign.statement
 
 
@@ -56,6 +58,34 @@ def test_a_wrong_sigma_shows_in_t_and_s0_and_not_in_f():
     assert not campaign.equivalent
     assert campaign.rho.value == pytest.approx(1.15, abs=0.06)
     assert "is not the achieved one" in campaign.statement
+
+
+def _drawn(weights, count, seed, factor=1.0):
+    """Members whose rho are drawn from their null distribution, times a factor."""
+    random = np.random.default_rng(seed)
+    mean, sd = log_rms_moments(weights)
+    rho = factor * np.sqrt(random.standard_normal((count, len(weights))) ** 2 @ (weights / weights.sum()))
+    return [
+        Member(
+            name=str(index), t_sum=60.0, nu=60, vpv=200.0, r=200, rho=value, log_rho_mean=mean, log_rho_sd=sd,
+            coverage=0.95, points_used=20, pits={"t": 0.5, "s0_squared": 0.5, "f": 0.5, "rho": 0.5},
+            predicted={"used": 2e-5}, achieved=2e-5 * value,
+        )
+        for index, value in enumerate(rho)
+    ]  # fmt: skip
+
+
+def test_weak_networks_pull_the_plain_mean_down_and_not_the_verdict():
+    weak, strong = np.geomspace(1, 1e-12, 60) ** 2, np.ones(60)
+    campaign = pool(_drawn(weak, 300, 1) + _drawn(strong, 100, 2))
+    assert campaign.plain["expected"] < 0.9
+    assert np.log(campaign.plain["used"] / campaign.plain["expected"]) == pytest.approx(0, abs=4 * campaign.plain["sd"])
+    assert campaign.rho.low < 1 < campaign.rho.high
+    # Weighted with their precision the strong networks count: 4 of their sd, about 0.04.
+    assert campaign.rho.value == pytest.approx(1.0, abs=0.04)
+    wrong = pool(_drawn(weak, 300, 1, factor=1.2) + _drawn(strong, 100, 2, factor=1.2))
+    assert wrong.rho.value == pytest.approx(1.2 * campaign.rho.value)
+    assert not wrong.equivalent
 
 
 def test_one_network_proves_nothing(right):
@@ -82,7 +112,8 @@ def test_repeats_split_bias_from_noise():
         errors = bias + 2e-5 * rng.standard_normal((50, 3))
         members.append(
             Member(
-                name="0", t_sum=143.0, nu=143, vpv=200.0, r=200, rho=1.0, nu_eff=80, coverage=0.95, points_used=50,
+                name="0", t_sum=143.0, nu=143, vpv=200.0, r=200, rho=1.0, log_rho_mean=-0.006, log_rho_sd=0.08,
+                coverage=0.95, points_used=50,
                 pits={"t": 0.5, "s0_squared": 0.5, "f": 0.5, "rho": 0.5}, predicted={"used": 2e-5}, achieved=2e-5,
                 errors=errors,
             )

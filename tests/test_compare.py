@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
+from scipy.special import digamma, polygamma
 from scipy.stats import chi2, kstest
 
 from netdesign.adjustment.bundle import adjust
 from netdesign.adjustment.compare import compare
 from netdesign.adjustment.estimate import estimate
-from netdesign.adjustment.statistics import WeightedChi2, rms_interval
+from netdesign.adjustment.statistics import WeightedChi2, log_rms_moments, rms_interval
 from netdesign.errors import InfeasibleError
 from netdesign.model.results import PointPrecision
 from netdesign.photogrammetry.total_error import total_covariance
@@ -32,6 +33,19 @@ def test_weighted_chi2_reduces_to_chi2_and_agrees_with_sampling():
     interval = rms_interval(1.0, weights, 0.95)
     assert interval.low < 1 < interval.high
     assert interval.inside
+
+
+def test_moments_of_log_rho_are_those_of_chi2_and_of_samples():
+    for dof in (1, 2, 5, 65, 900):
+        mean, sd = log_rms_moments(np.full(dof, 0.2))
+        assert mean == pytest.approx(0.5 * (digamma(dof / 2) + np.log(2 / dof)), abs=1e-9)
+        assert sd == pytest.approx(0.5 * np.sqrt(polygamma(1, dof / 2)), rel=1e-7)
+    weights = np.r_[1.0, 0.6, np.geomspace(0.1, 1e-5, 80), np.zeros(7)]
+    draws = np.random.default_rng(0).standard_normal((200_000, len(weights))) ** 2 @ (weights / weights.sum())
+    mean, sd = log_rms_moments(weights)
+    assert mean < -0.05  # weak: a right prediction has log rho well below 0
+    assert 0.5 * np.log(draws).mean() == pytest.approx(mean, abs=4 * sd / np.sqrt(200_000))
+    assert 0.5 * np.log(draws).std() == pytest.approx(sd, rel=4 / np.sqrt(2 * 200_000))
 
 
 def test_quadratic_form_equals_the_dense_matrix_and_ignores_the_gauge():

@@ -4,7 +4,12 @@ One network cannot confirm a prediction to 10 %; K of them can. Pooled over netw
 
     T = Σ Tᵢ ~ chi²(Σ nuᵢ),   v'Pv = Σ ~ chi²(Σ rᵢ),   F = (T/Σnu) / (v'Pv/Σr) ~ F(Σnu, Σr)
     PIT of every statistic uniform (Kolmogorov-Smirnov)
-    geometric mean of rho, slope of log achieved against log predicted
+    geometric mean of rho over its expectation, slope of log achieved against log predicted
+
+A single rho of a network with few effective degrees of freedom scatters widely and, as E rho² = 1, its logarithm lies
+low on average: by 1/(2 nu_eff), a tenth for nu_eff = 5. The plain geometric mean of right predictions is therefore
+below 1. Here every log rho is taken less its exact expectation and weighted with its exact variance
+(``statistics.log_rms_moments``); the plain mean and what is expected of it are reported beside.
 
 With real detectors the null hypothesis is never exactly true and a large campaign rejects it for a 2 % error of sigma.
 The decision is therefore one of equivalence (two one-sided tests of 5 %, D. J. Schuirmann,
@@ -33,7 +38,8 @@ class Member:
     """What one validated network gives to the campaign.
 
     Attributes:
-        name: of the network.  t_sum, nu, vpv, r: its sums.  rho, nu_eff: its RMS ratio and effective freedom.
+        name: of the network.  t_sum, nu, vpv, r: its sums.
+        rho: its RMS ratio.  log_rho_mean, log_rho_sd: of log rho when the prediction is right.
         pits: of "t", "s0_squared", "f" and "rho".
         predicted ("limited", "total", "used"), achieved: RMS, m.
         coverage: share inside the 95 % ellipsoids, of points_used points.
@@ -46,7 +52,8 @@ class Member:
     vpv: float
     r: float
     rho: float
-    nu_eff: float
+    log_rho_mean: float
+    log_rho_sd: float
     pits: dict[str, float]
     predicted: dict[str, float]
     achieved: float
@@ -89,8 +96,11 @@ class Campaign:
 
     Attributes:
         members: networks pooled.  t, s0_squared, f: pooled statistics with exact intervals.
-        rho: geometric mean of achieved / predicted from the observations used; root_f: square root of the pooled F.
-        against: geometric mean of achieved / predicted for "limited", "total" and "used".
+        rho: geometric mean of achieved / predicted from the observations used, each over its expectation and weighted
+            with its precision; root_f: square root of the pooled F.
+        against: the same of achieved / predicted for "limited", "total" and "used".
+        plain: plain geometric mean of the same, and what it is "expected" to be and the "sd" of its logarithm when all
+            predictions are right.
         slope: of log achieved against log predicted, with its 90 % interval; nan with fewer than three networks.
         kendall: rank correlation of predicted and achieved; nan with fewer than three networks.
         ks: p-value of the PITs' uniformity per statistic.  pits: the PITs, for histograms.
@@ -106,6 +116,7 @@ class Campaign:
     rho: Band
     root_f: Band
     against: dict[str, float]
+    plain: dict[str, float]
     slope: Band
     kendall: float
     ks: dict[str, float]
@@ -126,7 +137,8 @@ def member_of(name: str, validation: Validation) -> Member:
         vpv=sums["vpv"],
         r=sums["r"],
         rho=validation.rho.value,
-        nu_eff=validation.nu_eff,
+        log_rho_mean=validation.log_rho_mean,
+        log_rho_sd=validation.log_rho_sd,
         pits={
             "t": validation.t.pit,
             "s0_squared": validation.s0_squared.pit,
@@ -159,7 +171,15 @@ def pool(members: Sequence[Member], level: float = LEVEL) -> Campaign:
         high=float(np.sqrt(ratio / low)),
         margin=ROOT_F_MARGIN,
     )
-    rho = _geometric_mean(members)
+    rho = _typical_rho(members)
+    ratios = {
+        name: np.log([m.achieved / m.predicted[name] for m in members])
+        for name in ("limited", "total", "used")
+        if all(m.predicted.get(name) and np.isfinite(m.predicted[name]) for m in members)
+    }
+    expected, weight = np.array([m.log_rho_mean for m in members]), np.array([m.log_rho_sd for m in members]) ** -2.0
+    plain = {name: float(np.exp(logs.mean())) for name, logs in ratios.items()}
+    plain |= {"expected": float(np.exp(expected.mean())), "sd": float(np.sqrt((1.0 / weight).sum()) / len(members))}
     pits = {name: tuple(m.pits[name] for m in members) for name in ("t", "s0_squared", "f", "rho")}
     slope, kendall = _trend(members)
     points = sum(m.points_used for m in members)
@@ -171,48 +191,45 @@ def pool(members: Sequence[Member], level: float = LEVEL) -> Campaign:
         f=f_interval(ratio, int(nu), int(r), level),
         rho=rho,
         root_f=root_f,
-        against={
-            name: float(np.exp(np.mean([np.log(m.achieved / m.predicted[name]) for m in members])))
-            for name in ("limited", "total", "used")
-            if all(m.predicted.get(name) and np.isfinite(m.predicted[name]) for m in members)
-        },
+        against={name: float(np.exp(np.average(logs - expected, weights=weight))) for name, logs in ratios.items()},
+        plain=plain,
         slope=slope,
         kendall=kendall,
         ks={name: float(kstest(values, "uniform").pvalue) for name, values in pits.items()},
         pits=pits,
         coverage=float(sum(m.coverage * m.points_used for m in members) / points),
         equivalent=equivalent,
-        statement=_statement(len(members), rho, root_f),
+        statement=_statement(len(members), rho, root_f, plain),
         repeats=_repeats(members),
     )
 
 
-def _geometric_mean(members: Sequence[Member]) -> Band:
-    """Return the geometric mean of rho with its 90 % interval.
+def _typical_rho(members: Sequence[Member]) -> Band:
+    """Return the weighted geometric mean of rho over its expectation, with its 90 % interval.
 
-    The scatter of log rho is taken from the sample or from theory, sqrt(1 / (2 nu_eff)), whichever is larger: few
-    networks that happen to agree prove nothing.
+    The scatter is taken from theory or from the sample, whichever is larger: few networks that happen to agree prove
+    nothing.
     """
-    logs = np.log([m.rho for m in members])
-    count = len(logs)
-    theory = float(np.sqrt(np.mean([1.0 / (2.0 * m.nu_eff) for m in members]) / count))
-    half = 1.645 * theory
+    excess = np.log([m.rho for m in members]) - np.array([m.log_rho_mean for m in members])
+    weight = np.array([m.log_rho_sd for m in members]) ** -2.0
+    mean, count = float(np.average(excess, weights=weight)), len(members)
+    half = 1.645 / float(np.sqrt(weight.sum()))
     if count > 1:
-        half = max(half, float(t.ppf(0.95, count - 1) * logs.std(ddof=1) / np.sqrt(count)))
-    mean = float(logs.mean())
+        scatter = float((weight * (excess - mean) ** 2).sum() / (count - 1))
+        half = max(half, float(t.ppf(0.95, count - 1) * np.sqrt(scatter / weight.sum())))
     return Band(
         value=float(np.exp(mean)), low=float(np.exp(mean - half)), high=float(np.exp(mean + half)), margin=RHO_MARGIN
     )
 
 
 def _trend(members: Sequence[Member]) -> tuple[Band, float]:
-    """Return slope of log achieved against log predicted (weights 2 nu_eff), and Kendall's rank correlation."""
+    """Return slope of log achieved, less its expectation, against log predicted, and Kendall's rank correlation."""
     x = np.log([m.predicted["used"] for m in members])
-    y = np.log([m.achieved for m in members])
+    y = np.log([m.achieved for m in members]) - np.array([m.log_rho_mean for m in members])
     margin = (0.9, 1.1)
     if len(members) < 3 or np.ptp(x) < 1e-6:
         return Band(value=float("nan"), low=float("nan"), high=float("nan"), margin=margin), float("nan")
-    weight = np.array([2.0 * m.nu_eff for m in members])
+    weight = np.array([m.log_rho_sd for m in members]) ** -2.0
     centre = float((weight * x).sum() / weight.sum())
     scatter = float((weight * (x - centre) ** 2).sum())
     value = float((weight * (x - centre) * y).sum() / scatter)
@@ -240,7 +257,7 @@ def _repeats(members: Sequence[Member]) -> dict[str, Repeats]:
     return result
 
 
-def _statement(count: int, rho: Band, root_f: Band) -> str:
+def _statement(count: int, rho: Band, root_f: Band, plain: dict[str, float]) -> str:
     """Return the verdict in words: shown, refuted, or what it would take to decide."""
     tested = (rho, root_f)
     if all(band.equivalent for band in tested):
@@ -261,7 +278,10 @@ def _statement(count: int, rho: Band, root_f: Band) -> str:
     ]
     return (
         f"Over {count} realisation(s) the predicted accuracy {verdict} "
-        f"With 90 % intervals: achieved / predicted {bands[0]}; geometry alone, sqrt(F), {bands[1]}."
+        f"With 90 % intervals: achieved / predicted over its expectation {bands[0]}; geometry alone, sqrt(F), "
+        f"{bands[1]}. Plain geometric mean of achieved / predicted {plain['used']:.3f}; right predictions would give "
+        f"{plain['expected']:.3f} +- {plain['expected'] * plain['sd']:.3f}, below 1 because few directions carry most "
+        "of a network's error."
     )
 
 

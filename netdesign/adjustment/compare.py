@@ -17,7 +17,13 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2
 
-from netdesign.adjustment.statistics import chi2_interval, f_interval, rms_interval, sampled_interval
+from netdesign.adjustment.statistics import (
+    chi2_interval,
+    f_interval,
+    log_rms_moments,
+    rms_interval,
+    sampled_interval,
+)
 from netdesign.errors import InfeasibleError
 from netdesign.model.adjustment import Adjustment, Interval, Validation
 from netdesign.model.arrays import Floats
@@ -76,6 +82,7 @@ def compare(
     rho = rms_interval(float(np.sqrt((error**2).sum() / values.sum())), values, level)
     errors = np.full((len(used), 3), np.nan)
     errors[used] = aligned - truth[used]
+    log_mean, log_sd = log_rms_moments(values)
     reasons = _reasons(t, s0, ratio, rho, count)
     return Validation(
         errors=errors,
@@ -93,6 +100,8 @@ def compare(
         nees=sampled_interval(nees, nees_draws, level),
         sums={"t": t_sum, "nu": float(nu), "vpv": s0_squared * r, "r": float(r)},
         nu_eff=float(values.sum() ** 2 / (values**2).sum()),
+        log_rho_mean=log_mean,
+        log_rho_sd=log_sd,
         level=level,
         passed=not reasons,
         datum=adjustment.datum,

@@ -118,7 +118,9 @@ def campaign(record: RunRecord) -> Values | None:
         "pooled_caption": "All networks as one: T, s0² and F from summed squares, each in its exact 99 % interval.",
         "margins": charts.band_chart(_bands(content)),
         "margins_caption": "The decision is one of equivalence: the 90 % interval (line) has to lie inside the margin "
-        "(bar). ρ: geometric mean of achieved over predicted (P2). √F: the geometry alone.",
+        "(bar). ρ: geometric mean of achieved over predicted (P2), each network over its exact expectation, which "
+        "lies below 1 when few directions carry most of the error, and weighted with its precision. √F: the geometry "
+        "alone.",
         "ratios": _ratios(content),
         "pits": _histograms(content),
         "pit_caption": "The probability integral transforms of all networks. If every prediction is right they are "
@@ -143,7 +145,7 @@ def _decision(content: Values) -> str:
 
 
 def _bands(content: Values) -> list[charts.BandRow]:
-    rows = (("rho", "ρ", "geometric mean"), ("root_f", "√F", "geometry alone"))
+    rows = (("rho", "ρ", "over its expectation"), ("root_f", "√F", "geometry alone"))
     found = [(content.get(key) or {}, label, note) for key, label, note in rows]
     return [
         charts.BandRow(
@@ -160,10 +162,14 @@ def _bands(content: Values) -> list[charts.BandRow]:
 
 
 def _ratios(content: Values) -> list[Values]:
-    """Return achieved over predicted, geometric mean over the networks, for the three predictions."""
+    """Return achieved over predicted, over the networks, for the three predictions, and the plain geometric mean."""
     names = {"limited": "achieved / P0, limited", "total": "achieved / P1, total", "used": "achieved / P2, as measured"}
     ratios = content.get("achieved_over_predicted", {})
     rows = [{"name": names[key], "value": f"{ratios[key]:.3f}"} for key in names if ratios.get(key) is not None]
+    plain = content.get("plain_geometric_mean", {})
+    if plain.get("used") is not None:
+        rows.append({"name": "achieved / P2, plain geometric mean", "value": f"{plain['used']:.3f}"})
+        rows.append({"name": "the same, expected of right predictions", "value": f"{plain['expected']:.3f}"})
     if content.get("coverage95") is not None:
         rows.append({"name": "points inside 95 % ellipsoids", "value": f"{100 * content['coverage95']:.1f} %"})
     if content.get("kendall") is not None:

@@ -281,7 +281,7 @@ def _statement(count: int, rho: Band, root_f: Band, plain: dict[str, float]) -> 
         f"With 90 % intervals: achieved / predicted over its expectation {bands[0]}; geometry alone, sqrt(F), "
         f"{bands[1]}. Plain geometric mean of achieved / predicted {plain['used']:.3f}; right predictions would give "
         f"{plain['expected']:.3f} +- {plain['expected'] * plain['sd']:.3f}, below 1 because few directions carry most "
-        "of a network's error."
+        "of the error of a network."
     )
 
 

@@ -59,6 +59,7 @@ def _record(task: Task, seen: Coverage, reach: dict[str, float] | None, problems
         "part": {"triangles": len(part.faces), "size_mm": np.ptp(part.vertices, axis=0) * 1e3},
         "tags": len(targets.ids),
         "points": len(targets.points),
+        "left_out": list(task.left_out),
         "depth_of_field_mm": [near * 1e3, far * 1e3],
         "sightings": seen.refusals,
         "seen_share": {str(tag): float(share) for tag, share in zip(seen.tag_ids, seen.share, strict=True)},
@@ -78,6 +79,13 @@ def _text(record: dict[str, Any]) -> str:
         f"part       {record['part']['triangles']} triangles, {size} mm",
         f"tags       {record['tags']} tags, {record['points']} object points",
     ]
+    if record["left_out"]:
+        names = ", ".join(str(tag) for tag in record["left_out"][:12])
+        more = len(record["left_out"]) - 12
+        lines.append(
+            f"  left out, seen from too little of the sphere (targets.min_seen_share): {len(record['left_out'])} tags, "
+            f"{names}{f' and {more} more' if more > 0 else ''}"
+        )
     near, far = record["depth_of_field_mm"]
     if np.isfinite(far) or near > 0:
         lines.append(f"sharp      {near:.0f} mm to {far:.0f} mm along the optical axis")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from netdesign.errors import InputError
+from netdesign.errors import InfeasibleError, InputError
 from netdesign.files.study import load_task, resolve, write_resolved
 
 STUDY = """format = 1
@@ -143,3 +143,15 @@ def test_the_hash_follows_the_inputs(study, tmp_path):
     trimesh.creation.box((200, 150, 101)).export(tmp_path / "box.stl")
     assert resolve(study()).sha256 != before
     assert resolve(study(), seed=7).sha256 != resolve(study()).sha256
+
+
+def test_tags_that_the_sphere_hardly_sees_can_be_left_out(study):
+    every = load_task(study())
+    below = every.scene.targets.normals[:, 2] < -0.5  # the box stands on this face
+    assert below.any()
+    task = load_task(study("spacing_mm = 45", "spacing_mm = 45\nmin_seen_share = 0.01"))
+    assert sorted(task.left_out) == sorted(every.scene.targets.ids[below].tolist())
+    np.testing.assert_array_equal(task.scene.targets.ids, every.scene.targets.ids[~below])
+    np.testing.assert_array_equal(task.scene.targets.points, every.scene.targets.points[np.repeat(~below, 4)])
+    with pytest.raises(InfeasibleError, match=r"min_seen_share: none of the \d+ tags is seen from 90.0% of the sphere"):
+        load_task(study("spacing_mm = 45", "spacing_mm = 45\nmin_seen_share = 0.9"))

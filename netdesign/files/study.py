@@ -5,25 +5,26 @@ into a run directory (study.toml, inputs/); ``load_task`` turns a study file int
 """
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from netdesign.errors import InputError
+from netdesign.errors import InfeasibleError, InputError
 from netdesign.files.noise import read_corner_noise
 from netdesign.files.packages import resolve_path
 from netdesign.files.parts import load_part, load_targets, spread_targets
 from netdesign.files.robot import bundle_robot, resolve_cell
 from netdesign.files.store import write_bytes, write_text
 from netdesign.files.study_text import parse_study, read_toml, study_toml
-from netdesign.model.arrays import Floats
+from netdesign.model.arrays import Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.frames import pose, rotation_from_rpy
 from netdesign.model.scene import Part, Scene, Targets
 from netdesign.model.study import CameraTable, PartTable, Study, ViewpointsTable, VisibilityTable
 from netdesign.model.task import Task, ViewingSphere, VisibilityLimits
+from netdesign.photogrammetry.visibility import seen_share
 
 MM = 1e-3
 
@@ -130,13 +131,16 @@ def load_task(path: Path, seed: int | None = None) -> Task:
     part = load_part(_beside(path, part_table.mesh), part_table.unit, world_from_mesh)
     sphere = _sphere(study.viewpoints)
     _check_clearance(part, sphere, part_table, path)  # before tags are spread over a part in the wrong unit
-    targets = _targets(study, path, part, world_from_mesh)
+    scene = Scene(part=part, targets=_targets(study, path, part, world_from_mesh))
+    camera, limits = camera_of_table(study.camera, path), _limits(study.visibility)
+    scene, left_out = _worth_measuring(study, path, scene, camera, sphere, limits)
     return Task(
         study=resolved.study,
-        scene=Scene(part=part, targets=targets),
-        camera=camera_of_table(study.camera, path),
+        scene=scene,
+        left_out=left_out,
+        camera=camera,
         sphere=sphere,
-        limits=_limits(study.visibility),
+        limits=limits,
         cell=None if study.robot is None else resolve_cell(study.robot, path.parent),
         sha256=resolved.sha256,
     )
@@ -154,6 +158,22 @@ def _targets(study: Study, path: Path, part: Part, world_from_mesh: Floats) -> T
         return load_targets(_beside(path, table.file), table.family, size, world_from_mesh)
     assert table.spacing_mm is not None  # the table has exactly one of the two
     return spread_targets(part, table.family, size, table.spacing_mm * MM)
+
+
+def _worth_measuring(
+    study: Study, path: Path, scene: Scene, camera: Camera, sphere: ViewingSphere, limits: VisibilityLimits
+) -> tuple[Scene, tuple[int, ...]]:
+    """Return the scene without the tags that too little of the sphere sees, and their ids."""
+    least = study.targets.min_seen_share
+    if least == 0:
+        return scene, ()
+    kept = seen_share(scene, camera, sphere, limits) >= least
+    if not kept.any():
+        raise InfeasibleError(
+            f"{path}: targets.min_seen_share: none of the {len(kept)} tags is seen from {least:.1%} of the sphere"
+        )
+    ids: Ints = scene.targets.ids[~kept]
+    return replace(scene, targets=scene.targets.take(kept)), tuple(ids.tolist())
 
 
 def camera_of_table(table: CameraTable, path: Path) -> Camera:

@@ -1,10 +1,10 @@
 """The part, the AprilTags on it, and the two together."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from netdesign.model.arrays import Floats, Ints, frozen
+from netdesign.model.arrays import Bools, Floats, Ints, frozen
 
 CORNERS_PER_TAG = 4
 
@@ -54,6 +54,11 @@ class Targets:
         count = len(self.ids)
         for name in ("centres", "normals", "x_axes"):
             object.__setattr__(self, name, frozen(name, getattr(self, name), (count, 3)))
+
+    def take(self, rows: Bools) -> "Targets":
+        """Return the tags chosen by ``rows`` (g,)."""
+        kept = {name: getattr(self, name)[rows] for name in ("ids", "centres", "normals", "x_axes")}
+        return replace(self, **kept)
 
     @property
     def points(self) -> Floats:

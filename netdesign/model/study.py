@@ -37,6 +37,9 @@ class TargetsTable(Table):
     size_mm: Positive = Field(description="edge of the black square")
     file: str | None = Field(None, description="CSV: tag,x_mm,y_mm,z_mm,nx,ny,nz,ux,uy,uz")
     spacing_mm: Positive | None = Field(None, description="instead of file: grid spacing of tags on every large face")
+    min_seen_share: Annotated[float, Field(ge=0, lt=1)] = Field(
+        0, description="tags seen from a smaller share of the admissible sphere are left out; 0: every tag must be seen"
+    )
 
     @model_validator(mode="after")
     def _one_source(self) -> "TargetsTable":

@@ -38,6 +38,16 @@ class ViewingSphere:
         position = self.centre + self.radius * sphere_directions(viewpoints)
         return look_at(position, self.centre, (self.roll or 0.0) if roll is None else roll)
 
+    def sample(self, step: float) -> tuple[Floats, Floats]:
+        """Return viewpoints (c, 2) in the middle of equal steps of ``step`` rad and their shares (c,) of the area."""
+        (low_a, high_a), (low_b, high_b) = self.azimuth, self.elevation
+        rows, columns = max(1, round((high_b - low_b) / step)), max(1, round((high_a - low_a) / step))
+        edges = np.linspace(low_b, high_b, rows + 1)
+        alpha = np.linspace(low_a, high_a, columns + 1)[:-1] + 0.5 * (high_a - low_a) / columns
+        beta = 0.5 * (edges[1:] + edges[:-1])
+        share = np.diff(np.sin(edges)) / (np.sin(edges[-1]) - np.sin(edges[0])) / columns
+        return np.stack([np.tile(alpha, rows), np.repeat(beta, columns)], axis=1), np.repeat(share, columns)
+
 
 @dataclass(frozen=True, kw_only=True)
 class VisibilityLimits:
@@ -105,6 +115,7 @@ class Task:
     Attributes:
         study: the file as read, for names, seeds and settings without a unit.
         sha256: of the resolved study text and its inputs, hexadecimal.
+        left_out: ids of tags that are seen from less than ``targets.min_seen_share`` of the sphere: not in the scene.
     """
 
     study: Study
@@ -114,3 +125,4 @@ class Task:
     limits: VisibilityLimits
     cell: RobotCell | None
     sha256: str
+    left_out: tuple[int, ...] = ()

@@ -19,11 +19,13 @@ from numpy.typing import NDArray
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.scene import CORNERS_PER_TAG, Scene, Targets
-from netdesign.model.task import VisibilityLimits
+from netdesign.model.task import ViewingSphere, VisibilityLimits
 from netdesign.photogrammetry.bvh import TriangleTree
 
 REASONS = ("seen", "behind", "incidence", "frame", "size", "depth of field", "occluded")
 SEEN, BEHIND, INCIDENCE, FRAME, SIZE, DEPTH_OF_FIELD, OCCLUDED = range(len(REASONS))
+
+SAMPLE_STEP = np.radians(2.0)  # between the viewpoints that stand for a whole sphere
 
 # A line of sight ends this share of the tag's edge above the tag's plane: the tag lies on the mesh, and files round.
 CLEARANCE = 1e-3
@@ -60,6 +62,13 @@ def sightings(scene: Scene, camera: Camera, world_from_cam: Floats, limits: Visi
     To ask many times about one scene, keep ``Sight(scene, camera, limits)`` and call its ``look``.
     """
     return Sight(scene, camera, limits).look(world_from_cam)
+
+
+def seen_share(scene: Scene, camera: Camera, sphere: ViewingSphere, limits: VisibilityLimits) -> Floats:
+    """Return (g,) the share of the admissible sphere from which each tag is seen, sampled at ``SAMPLE_STEP``."""
+    viewpoints, weights = sphere.sample(SAMPLE_STEP)
+    share: Floats = weights @ sightings(scene, camera, sphere.cameras(viewpoints), limits).visible_tags
+    return share
 
 
 class Sight:

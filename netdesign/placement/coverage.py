@@ -10,10 +10,8 @@ from netdesign.errors import InfeasibleError
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
-from netdesign.photogrammetry.visibility import REASONS, SEEN, sightings
+from netdesign.photogrammetry.visibility import REASONS, SAMPLE_STEP, SEEN, sightings
 from netdesign.placement.visibility_map import VisibilityMap
-
-SAMPLE_STEP = np.radians(2.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +71,8 @@ class Coverage:
             names = ", ".join(str(self.tag_ids[g]) for g in unseen[:8]) + (", …" if unseen.size > 8 else "")
             lines.append(
                 f"{unseen.size} of {len(self.never)} tags ({CORNERS_PER_TAG * unseen.size} object points) are seen "
-                f"from no admissible viewpoint (refused mostly: {counts}): tags {names}"
+                f"from no admissible viewpoint (refused mostly: {counts}): tags {names}; targets.min_seen_share = 0.01 "
+                "leaves such tags out"
             )
         if self.lonely.any():
             lines.append(
@@ -102,7 +101,7 @@ def coverage(task: Task, visibility_map: VisibilityMap | None = None) -> Coverag
     scene, sphere, limits = task.scene, task.sphere, task.limits
     if visibility_map is None:
         visibility_map = VisibilityMap.build(scene, task.camera, sphere, limits)
-    viewpoints, weights = _sample(sphere.azimuth, sphere.elevation)
+    viewpoints, weights = sphere.sample(SAMPLE_STEP)
     reason = sightings(scene, task.camera, sphere.cameras(viewpoints), limits).reason
     possible = _distinct(visibility_map)
     enough = possible.sum(axis=1) * CORNERS_PER_TAG >= limits.min_points_per_image
@@ -156,14 +155,3 @@ def _dominated(rows: Bools) -> Bools:
             dominated[index] = False
             kept = np.concatenate([kept, rows[index : index + 1]])
     return dominated
-
-
-def _sample(azimuth: tuple[float, float], elevation: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Viewpoints (c, 2) in the middle of equal steps and their shares (c,) of the area."""
-    rows = max(1, round((elevation[1] - elevation[0]) / SAMPLE_STEP))
-    columns = max(1, round((azimuth[1] - azimuth[0]) / SAMPLE_STEP))
-    edges = np.linspace(*elevation, rows + 1)
-    alpha = np.linspace(*azimuth, columns + 1)[:-1] + 0.5 * (azimuth[1] - azimuth[0]) / columns
-    beta = 0.5 * (edges[1:] + edges[:-1])
-    share = np.diff(np.sin(edges)) / (np.sin(edges[-1]) - np.sin(edges[0])) / columns
-    return np.stack([np.tile(alpha, rows), np.repeat(beta, columns)], axis=1), np.repeat(share, columns)

@@ -193,7 +193,8 @@ def _inputs(record: RunRecord) -> list[dict[str, str]]:
         ("Part", f"{study.part.mesh}, {len(task.scene.part.faces)} triangles, "
                  f"{size[0]:.1f} × {size[1]:.1f} × {size[2]:.1f} mm"),
         ("Targets", f"{len(task.scene.targets.ids)} tags {study.targets.family}, {study.targets.size_mm:g} mm, "
-                    f"{len(task.scene.targets.points)} object points"),
+                    f"{len(task.scene.targets.points)} object points"
+                    + (f"; {len(task.left_out)} left out, hardly seen" if task.left_out else "")),
         ("Camera", f"{camera.width_px} × {camera.height_px} px, f = {camera.focal_px[0]:g} px"
                    + (f", pixel {camera.pixel_um:g} µm" if camera.pixel_um else "")),
         ("Distortion k1 k2 p1 p2", ", ".join(f"{value:g}" for value in camera.distortion)),

@@ -12,6 +12,7 @@ from netdesign.model.progress import Progress, silent
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
 from netdesign.placement.coverage import Coverage, coverage
+from netdesign.placement.distances import named_ends
 
 RARELY_SEEN = 0.05
 
@@ -32,6 +33,7 @@ def check_study(path: Path, progress: Progress = silent) -> Findings:
         InputError: the study or an input is wrong.
     """
     task = load_task(path)
+    named_ends(task)
     progress("check", 1, 3, "visibility")
     seen = coverage(task)
     progress("check", 2, 3, "robot")

@@ -6,17 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from netdesign.errors import InputError
+from netdesign.errors import InfeasibleError, InputError
 from netdesign.files.store import plain, read_json
-from netdesign.model.arrays import Floats
+from netdesign.model.arrays import Bools, Floats
 from netdesign.model.task import Task
+from netdesign.photogrammetry.total_error import FLAG_RATIO
 from netdesign.placement import decide
 from netdesign.placement.decide import Requirement
-from netdesign.placement.distances import distance_u95
+from netdesign.placement.distances import SIGMA, distance_name, distance_u95, named_ends
 from netdesign.run_folder import open_run
 
 MM = 1e-3
-SIGMA = "largest point sigma"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +83,7 @@ def front_rows(run: Path) -> list[FrontRow]:
     """
     design = read_design(run)
     networks = design["networks"]
-    best = networks[decide.knee(objectives_of(design))]["id"]
+    best = networks[_knee(design, np.ones(len(networks), dtype=bool))]["id"]
     unit = design["objectives"][1]["unit"]
     rows = [
         FrontRow(
@@ -133,9 +133,12 @@ def choose(
         requirements = _limits(design, max_sigma_um, max_images, max_tour)
     else:
         requirements = _limits(design, own.max_sigma_um, own.max_images, own.max_tour) + _distances(design, task)
+    answer = design.get("answer")
+    if not asked_here and answer is not None and not answer["met"]:
+        raise InfeasibleError(answer["reason"])
     met = decide.admissible(requirements, len(networks))
     by_knee = knee or not requirements
-    index = decide.knee(objectives, met) if by_knee else decide.cheapest(objectives, met)
+    index = _knee(design, met) if by_knee else decide.cheapest(objectives, met)
     rows = front_rows(run)
     row = next(row for row in rows if row.network == networks[index]["id"])
     asked = tuple(
@@ -185,6 +188,17 @@ def poses_of(network: dict[str, Any]) -> Floats:
     return poses
 
 
+def _knee(design: dict[str, Any], admissible: Bools) -> int:
+    """Return the knee of the networks that total error propagation does not flag, of all when it flags every one."""
+    sound = admissible & ~np.array([_flagged(item) for item in design["networks"]])
+    return decide.knee(objectives_of(design), sound if sound.any() else admissible)
+
+
+def _flagged(network: dict[str, Any]) -> bool:
+    limited, total = network["rms_sigma_um"], network.get("total_rms_sigma_um")
+    return bool(network.get("flagged")) or total is None or limited is None or (total / limited) ** 2 > FLAG_RATIO
+
+
 def _limits(
     design: dict[str, Any], max_sigma_um: float | None, max_images: int | None, max_tour: float | None
 ) -> list[Requirement]:
@@ -206,18 +220,12 @@ def _limits(
 def _distances(design: dict[str, Any], task: Task) -> list[Requirement]:
     """Return the requirements on distances, their U95 (k = 2) from the total covariance of every network."""
     asked = task.study.requirements.distances
-    ids = task.scene.targets.point_ids
-    for name in [end for item in asked for end in (item.from_, item.to)]:
-        if name not in ids:
-            raise InputError(f"study.toml: requirements.distances: expected tag.corner of the part, found {name!r}")
     if not asked:
         return []
-    ends = np.array([[ids.index(item.from_), ids.index(item.to)] for item in asked])
+    ends = named_ends(task)
     values = np.array([distance_u95(task, poses_of(network), ends) for network in design["networks"]]) * 1e6
     return [
-        Requirement(
-            name=f"U95 of the distance {item.from_} to {item.to}", unit="µm", limit=item.u95_um, values=values[:, index]
-        )
+        Requirement(name=distance_name(item.from_, item.to), unit="µm", limit=item.u95_um, values=values[:, index])
         for index, item in enumerate(asked)
     ]
 

@@ -104,4 +104,13 @@ def _summary(task: Task, run: Path, design: Design, evaluations: int) -> str:
             f"  {size:2d} images: {len(layer)} networks, rms sigma {min(sigma):.2f} to {max(sigma):.2f} um, "
             f"tour {min(tour):.4g} to {max(tour):.4g} {unit}"
         )
-    return "\n".join([*lines, *design.notes])
+    lines += design.notes
+    if design.answer is not None:
+        network = design.networks[design.answer]
+        lines.append(
+            f"requirements: network {design.answer:04d} is the cheapest that meets them, {network.f3} images,"
+            f" tour {scale * network.f2:.4g} {unit}: {design.answer_reason}"
+        )
+    elif design.answer_reason is not None:
+        lines.append(f"requirements: {design.answer_reason}")
+    return "\n".join(lines)

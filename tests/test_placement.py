@@ -220,13 +220,16 @@ def test_differences_equal_the_whole_evaluation(box):
     assert {-1, 0, 1} <= set((sizes[:, None] - members.bits.sum(axis=1)).ravel().tolist())
 
 
-@pytest.mark.parametrize("objectives", [{"precision": "max_sigma"}, {"propagation": "total"}])
+@pytest.mark.parametrize("objectives", [{"precision": "max_sigma"}, {"propagation": "total"}, {"propagation": "block"}])
 def test_other_criteria(objectives):
     problem = Problem.build(task_of(plate_scene(side=3), max_images=6, objectives=objectives))
     design = finish(problem, run(problem, "memetic", 20, 15, 1))
     for network in design.networks:
         if "precision" in objectives:
             assert network.f1 == network.precision.sigma.max()
+        elif objectives["propagation"] == "block":
+            assert network.precision.propagation == "limited"
+            assert network.precision.mean_variance < network.f1 < 3 * network.total.mean_variance
         else:
             assert network.precision.propagation == "total"
             assert network.f1 == network.total.mean_variance

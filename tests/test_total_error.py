@@ -5,7 +5,7 @@ from netdesign.model.frames import exp_rotation, look_at, pose
 from netdesign.photogrammetry.datum import inner_basis, point_null_space
 from netdesign.photogrammetry.observation_equations import parameter_matrix
 from netdesign.photogrammetry.total_error import total_covariance
-from netdesign.photogrammetry.total_trace import total_trace
+from netdesign.photogrammetry.total_trace import block_trace, propagated, total_trace
 from tests.bundle_cases import (
     INTRINSICS,
     bordered_covariance,
@@ -59,6 +59,44 @@ def test_trace_kernel_equals_full_solution():
         assert fast == pytest.approx(total.trace, rel=1e-9)
     one = total_trace(poses, points, INTRINSICS, visible, np.array([[0.1]]), inner_basis(points))
     assert one == pytest.approx(total_covariance(poses, points, INTRINSICS, visible, 0.1).trace, rel=1e-9)
+
+
+def test_functions_of_the_points_equal_the_joint_covariance():
+    for seed in range(3):
+        poses, points = relief(5 + seed, 30, seed=seed)
+        visible = random_visibility(len(poses), 30, 0.7, seed)
+        total = total_covariance(poses, points, INTRINSICS, visible, 0.1)
+        basis = inner_basis(points)
+        functions = np.random.default_rng(seed).normal(size=(3 * len(points), 3))
+        functions -= basis @ (basis.T @ functions)
+        found = propagated(poses, points, INTRINSICS, visible, np.array([[0.1]]), np.hstack([basis, functions]), False)
+        assert found[0] == pytest.approx(total.trace, rel=1e-9)
+        np.testing.assert_allclose(found[1:], np.diag(functions.T @ total.joint() @ functions), rtol=1e-8)
+
+
+def test_the_block_diagonal_middle_equals_its_dense_formula():
+    """tr D + Σ_i tr(S_ii⁻¹ B_iᵀ B_i) (notes, adjustment, section 4), from the dense normal equations."""
+    for seed in range(3):
+        poses, points = relief(4 + seed, 25, seed=seed)
+        visible = random_visibility(len(poses), 25, 0.8, seed)
+        sigma = np.array([[0.1]])
+        design, _ = dense_design(poses, points, observe(poses, points, visible, 0.1))
+        normal, cameras = design.T @ design, 6 * len(poses)
+        pp, pc, cc = normal[cameras:, cameras:], normal[cameras:, :cameras], normal[:cameras, :cameras]
+        limited = np.linalg.inv(pp)
+        coupling = limited @ pc
+        schur = cc - pc.T @ coupling
+        expected = np.trace(limited)
+        for first in range(0, cameras, 6):
+            own = slice(first, first + 6)
+            expected += np.trace(np.linalg.inv(schur[own, own]) @ coupling[:, own].T @ coupling[:, own])
+        found = block_trace(poses, points, INTRINSICS, visible, sigma)
+        assert found == pytest.approx(expected, rel=1e-8)
+        total = total_covariance(poses, points, INTRINSICS, visible, sigma)
+        assert found >= np.trace(total.limited, axis1=1, axis2=2).sum()
+    alone = visible.copy()
+    alone[0, 2:] = False  # two points do not hold an image
+    assert block_trace(poses, points, INTRINSICS, alone, sigma) == np.inf
 
 
 def test_laws_rigid_motion_scale_and_noise():

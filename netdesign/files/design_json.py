@@ -59,6 +59,9 @@ def write_design(path: Path, task: Task, design: Design) -> None:
         "history": {"evaluations": design.history.evaluations, "hypervolume": design.history.hypervolume},
         "bounds": [{"images": size, "f1_mm2": bound / MM**2} for size, bound in sorted(design.bounds.items())],
         "notes": list(design.notes),
+        "answer": None
+        if design.answer_reason is None
+        else {"network": design.answer, "reason": design.answer_reason, "met": design.answer is not None},
         "networks": [_network(number, network, (f1_scale, f2_scale)) for number, network in enumerate(design.networks)],
     }
     write_json(path, "design", payload, task.sha256)
@@ -117,6 +120,7 @@ def _network(number: int, network: DesignedNetwork, scales: tuple[float, float])
         "sigma_um": network.precision.sigma / UM,
         "total_sigma_um": None if total is None else total.sigma / UM,
         "warnings": list(network.warnings),
+        "flagged": network.flagged,
     }
 
 

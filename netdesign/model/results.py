@@ -74,6 +74,7 @@ class DesignedNetwork:
         precision: the search criterion's propagation; total: full bundle adjustment, inner constraints over all points.
         bound_ratio: f1 / lower bound for this number of images, >= 1; None when no bound was computed.
         warnings: what the total propagation or the robot has to say about it.
+        flagged: the total propagation finds it weak: such a network is recommended only when there is no other.
     """
 
     viewpoints: Floats
@@ -86,6 +87,7 @@ class DesignedNetwork:
     total: PointPrecision | None
     bound_ratio: float | None
     warnings: tuple[str, ...] = ()
+    flagged: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "viewpoints", frozen("viewpoints", self.viewpoints, ("n", 2)))
@@ -115,9 +117,13 @@ class Design:
 
     Attributes:
         bounds: proven lower bound on f1 (m²) for each number of images it was computed for.
+        answer: index of the cheapest network that keeps the study's requirements; None when none does or none is asked.
+        answer_reason: how it keeps them, or what binds and what would satisfy it; None when nothing is asked.
     """
 
     networks: tuple[DesignedNetwork, ...]
     history: SearchHistory
     bounds: dict[int, float]
     notes: tuple[str, ...] = ()
+    answer: int | None = None
+    answer_reason: str | None = None

@@ -143,10 +143,18 @@ class ObjectivesTable(Table):
     """[objectives]: what is minimised."""
 
     precision: Literal["mean_variance", "max_sigma"] = "mean_variance"
-    propagation: Literal["limited", "total"] = "limited"
+    propagation: Literal["limited", "block", "total"] = Field(
+        "limited", description="block: between the two, each image by itself; of the mean variance only"
+    )
     motion: Literal["workspace", "joint", "time"] | None = Field(
         None, description="default: joint with a robot, else workspace"
     )
+
+    @model_validator(mode="after")
+    def _block_has_no_points(self) -> "ObjectivesTable":
+        if self.propagation == "block" and self.precision != "mean_variance":
+            raise ValueError(f"propagation: block propagation gives the mean variance only, found {self.precision!r}")
+        return self
 
 
 class DistanceRequirement(Table):

@@ -1,11 +1,16 @@
-"""The trace of the total covariance as a search criterion: compiled, no (3m, 3m) matrix, no Python objects.
+"""Total error propagation as a search criterion: compiled, no (3m, 3m) matrix, no Python objects.
 
-Same quantity as ``total_error.total_covariance(...).trace`` for free poses and known interior orientation:
+Same quantities as ``total_error.total_covariance`` for free poses and known interior orientation:
 
     trace Σ = tr D - tr QᵀDQ + tr S⁻ (BᵀB - UUᵀ),   U = BᵀQ
+    variance of gᵀx = gᵀDg + uᵀS⁻u,   u = Bᵀg,      g projected to the datum
 
 S⁻ comes from the Cholesky factor of the Jacobi-scaled S bordered by the datum's null space; a pivot that vanishes
-means an undetermined network and gives inf.
+means an undetermined network and gives inf. The block-diagonal middle takes each image by itself,
+
+    tr D + Σ_i tr(S_ii⁻¹ (BᵀB)_ii),
+
+at the cost of a few limited propagations: it sees an image that hangs loose, but not two groups of images that do.
 """
 
 import numpy as np
@@ -16,7 +21,7 @@ from netdesign.model.arrays import Bools, Floats
 PIVOT = 1e-12  # of the scaled normal matrix with unit diagonal: below it the network is not determined
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
+@njit(cache=True, error_model="numpy")
 def total_trace(
     world_from_cam: Floats, points: Floats, intrinsics: Floats, visible: Bools, sigma_px: Floats, basis: Floats
 ) -> float:
@@ -27,12 +32,34 @@ def total_trace(
         visible: (n, m).  sigma_px: (n, m) or (1, 1) for one sigma.
         basis: (3m, 7) from ``datum.inner_basis(points)``, once per object.
     """
+    return float(propagated(world_from_cam, points, intrinsics, visible, sigma_px, basis, False)[0])
+
+
+@njit(cache=True, error_model="numpy")
+def block_trace(world_from_cam: Floats, points: Floats, intrinsics: Floats, visible: Bools, sigma_px: Floats) -> float:
+    """Return the block-diagonal middle between limited and total trace (m²); arguments as of :func:`total_trace`."""
+    return float(propagated(world_from_cam, points, intrinsics, visible, sigma_px, np.zeros((0, 7)), True)[0])
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
+def propagated(
+    world_from_cam: Floats, points: Floats, intrinsics: Floats, visible: Bools, sigma_px: Floats, basis: Floats,
+    blocks: bool,
+) -> Floats:  # fmt: skip
+    """Return (1 + d,) the trace (m²) and the variances of d linear functions of the points; inf when not determined.
+
+    Args:
+        basis: (3m, 7 + d): the datum's basis, then the functions g, projected to it: orthogonal to the basis.
+        blocks: only the trace, each image by itself; ``basis`` is then not read.
+        Others: as of :func:`total_trace`.
+    """
     images, count = visible.shape
-    width = 6 * images
+    width, columns = 6 * images, 0 if blocks else basis.shape[1]
+    undetermined = np.full(max(columns - 6, 1), np.inf)
     schur = np.zeros((width, width))
     spread = np.zeros((width, width))  # BᵀB
-    turned = np.zeros((width, 7))  # U
-    gauge_part = np.zeros((7, 7))  # QᵀDQ
+    turned = np.zeros((width, columns))  # U
+    gauge_part = np.zeros((columns, columns))  # QᵀDQ
     scale = np.zeros(width)
     cross = np.zeros((images, 3, 6))
     solved = np.zeros((images, 3, 6))
@@ -50,7 +77,7 @@ def total_trace(
                 continue
             sigma = sigma_px[0, 0] if one_sigma else sigma_px[i, j]
             if not _derivatives(world_from_cam[i], points[j], intrinsics, 1.0 / sigma, pose, point):
-                return np.inf
+                return undetermined
             seen[rays] = i
             for a in range(3):
                 for b in range(6):
@@ -69,14 +96,16 @@ def total_trace(
         determinant = n00 * c00 + n01 * c01 + n02 * c02
         size = (n00 + n11 + n22) / 3.0
         if rays < 2 or not determinant > 1e-12 * size**3:
-            return np.inf
+            return undetermined
         inverse[0, 0], inverse[0, 1], inverse[0, 2] = c00 / determinant, c01 / determinant, c02 / determinant
         inverse[1, 1], inverse[1, 2] = (n00 * n22 - n02 * n02) / determinant, (n01 * n02 - n00 * n12) / determinant
         inverse[2, 2] = (n00 * n11 - n01 * n01) / determinant
         inverse[1, 0], inverse[2, 0], inverse[2, 1] = inverse[0, 1], inverse[0, 2], inverse[1, 2]
         trace += inverse[0, 0] + inverse[1, 1] + inverse[2, 2]
-        for a in range(7):
-            for b in range(7):
+        for a in range(columns):
+            for b in range(columns):
+                if a != b and (a >= 7 or b >= 7):
+                    continue
                 value = 0.0
                 for r in range(3):
                     for c in range(3):
@@ -90,14 +119,14 @@ def total_trace(
                     )
             for b in range(6):
                 row = 6 * seen[k] + b
-                for g in range(7):
+                for g in range(columns):
                     turned[row, g] += (
                         solved[k, 0, b] * basis[3 * j, g]
                         + solved[k, 1, b] * basis[3 * j + 1, g]
                         + solved[k, 2, b] * basis[3 * j + 2, g]
                     )
         for k in range(rays):
-            for other in range(k + 1):
+            for other in range(k if blocks else 0, k + 1):
                 for a in range(6):
                     row = 6 * seen[k] + a
                     for b in range(a + 1 if other == k else 6):
@@ -112,15 +141,17 @@ def total_trace(
                             + solved[k, 1, a] * solved[other, 1, b]
                             + solved[k, 2, a] * solved[other, 2, b]
                         )
+    if blocks:
+        return np.full(1, trace + _image_by_image(schur, spread))
     for g in range(7):
         trace -= gauge_part[g, g]
     gauge = _gauge(world_from_cam, points)
     for a in range(width):
         scale[a] = 1.0 / np.sqrt(schur[a, a]) if schur[a, a] > 0 else 0.0
         if scale[a] == 0.0:
-            return np.inf
+            return undetermined
     if not _orthonormalise(gauge, scale):
-        return np.inf
+        return undetermined
     for a in range(width):
         for b in range(a + 1):
             schur[a, b] *= scale[a] * scale[b]
@@ -129,12 +160,44 @@ def total_trace(
                 spread[a, b] -= turned[a, g] * turned[b, g]
             spread[a, b] *= scale[a] * scale[b]
     if not _invert(schur):
-        return np.inf
+        return undetermined
     for a in range(width):
         trace += schur[a, a] * spread[a, a]
         for b in range(a):
             trace += 2.0 * schur[a, b] * spread[a, b]
-    return trace if trace > 0 else np.inf
+    result = undetermined
+    result[0] = trace if trace > 0 else np.inf
+    for g in range(7, columns):
+        value = gauge_part[g, g]
+        for a in range(width):
+            value += schur[a, a] * (scale[a] * turned[a, g]) ** 2
+            for b in range(a):
+                value += 2.0 * schur[a, b] * scale[a] * turned[a, g] * scale[b] * turned[b, g]
+        result[g - 6] = value if value > 0 else np.inf
+    return result
+
+
+@njit(cache=True, error_model="numpy")
+def _image_by_image(schur: Floats, spread: Floats) -> float:
+    """Return Σ_i tr(S_ii⁻¹ (BᵀB)_ii) from the lower triangles of S and BᵀB; inf when an image is not determined."""
+    value = 0.0
+    block = np.zeros((6, 6))
+    scale = np.zeros(6)
+    for first in range(0, len(schur), 6):
+        for a in range(6):
+            if not schur[first + a, first + a] > 0.0:
+                return np.inf
+            scale[a] = 1.0 / np.sqrt(schur[first + a, first + a])
+        for a in range(6):
+            for b in range(a + 1):
+                block[a, b] = schur[first + a, first + b] * scale[a] * scale[b]
+        if not _invert(block):
+            return np.inf
+        for a in range(6):
+            for b in range(a + 1):
+                twice = 1.0 if a == b else 2.0
+                value += twice * block[a, b] * scale[a] * scale[b] * spread[first + a, first + b]
+    return value
 
 
 @njit(cache=True, error_model="numpy")

@@ -21,10 +21,14 @@ from netdesign.motion.tour import open_path
 from netdesign.photogrammetry.limited_error import limited_covariance
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_error import total_covariance
+from netdesign.photogrammetry.total_trace import block_trace
 from netdesign.photogrammetry.visibility import Sight
 from netdesign.placement.bound import lower_bounds
+from netdesign.placement.decide import round_up
 from netdesign.placement.problem import Problem
+from netdesign.placement.tolerance import cheapest_admissible, without_tour_limit
 from netdesign.search.archive import non_dominated
+from netdesign.search.engine import run as search
 from netdesign.search.state import State
 
 LIMITED_DATUM = "fixed: the poses are error-free"
@@ -59,19 +63,28 @@ def finish(problem: Problem, state: State, progress: Progress = silent) -> Desig
         else:
             networks.append(found)
     progress("exact networks", len(rows), len(rows))
+    answer = cheapest_admissible(problem, members, exact.network)
+    best = None if answer is None else answer.network
+    if best is not None:  # what dominates it without keeping the requirements is no answer
+        networks = [network for network in networks if not _dominates(network, best)] + [best]
     if not networks:
         raise InfeasibleError("no network of the search survived the exact check: " + _counts(dropped))
     objectives = np.array([[network.f1, network.f2, network.f3] for network in networks])
     kept = non_dominated(objectives)
     dropped["dominated once computed exactly"] += len(networks) - len(kept)
-    kept = kept[spread(objectives[kept], most)]
-    kept = kept[np.lexsort((objectives[kept, 0], objectives[kept, 2]))]
+    place = None if best is None else len(networks) - 1
+    rest = kept[kept != place]
+    kept = rest[spread(objectives[rest], max(1, most - (place is not None)))]
+    kept = kept if place is None else np.append(kept, place)
+    kept = kept[np.lexsort((objectives[kept, 1], objectives[kept, 0], objectives[kept, 2]))]
     bounds = lower_bounds(task, sorted({networks[row].f3 for row in kept}), problem.visibility)
     return Design(
         networks=tuple(_bounded(networks[row], bounds) for row in kept.tolist()),
         history=SearchHistory(evaluations=state.evaluations, hypervolume=state.hypervolume),
         bounds=bounds,
         notes=tuple(_notes(problem, [networks[row] for row in kept.tolist()], dropped)),
+        answer=None if answer is None else (None if place is None else int(np.flatnonzero(kept == place)[0])),
+        answer_reason=None if answer is None else answer.reason,
     )
 
 
@@ -90,7 +103,8 @@ class Exact:
         if isinstance(planned, str):
             return planned
         viewpoints, world_from_cam, tour, warnings = planned
-        if tour.length > self.problem.tables.longest:
+        joint = self.problem.joint
+        if tour.length > (self.problem.tables.longest if joint is None else joint.longest):
             return "longer tour than requirements.max_tour"
         visible = self.sight.look(world_from_cam).visible
         rays = visible.sum(axis=0)
@@ -105,11 +119,17 @@ class Exact:
         if total is None:
             return "not determined in total error propagation"
         precision = total if task.study.objectives.propagation == "total" else limited
-        worst = task.study.objectives.precision == "max_sigma"
+        f1 = precision.mean_variance
+        if task.study.objectives.precision == "max_sigma":
+            f1 = float(precision.sigma.max())
+        elif task.study.objectives.propagation == "block":
+            sigma = sighting_sigma(task.camera, world_from_cam, task.scene.targets)
+            points, intrinsics = task.scene.targets.points, task.camera.intrinsics
+            f1 = block_trace(world_from_cam, points, intrinsics, visible, sigma) / (3 * len(points))
         return DesignedNetwork(
             viewpoints=viewpoints,
             world_from_cam=world_from_cam,
-            f1=float(precision.sigma.max()) if worst else precision.mean_variance,
+            f1=f1,
             f2=tour.length,
             f3=len(viewpoints),
             tour=tour,
@@ -117,6 +137,7 @@ class Exact:
             total=total,
             bound_ratio=None,
             warnings=(*warnings, *complaints),
+            flagged=bool(complaints),
         )
 
     def _planned(self, viewpoints: Floats) -> tuple[Floats, Floats, Tour, Sequence[str]] | str:
@@ -180,6 +201,10 @@ def spread(objectives: Floats, most: int) -> Ints:
     return np.sort(np.array(chosen, dtype=np.int64))
 
 
+def _dominates(one: DesignedNetwork, other: DesignedNetwork) -> bool:
+    return one.f1 <= other.f1 and one.f2 <= other.f2 and one.f3 <= other.f3
+
+
 def _bounded(network: DesignedNetwork, bounds: dict[int, float]) -> DesignedNetwork:
     bound = bounds.get(network.f3)
     if bound is None:
@@ -235,11 +260,24 @@ def why_infeasible(problem: Problem, state: State) -> str:
         refused = (~problem.joint_map.reachable(viewpoints)).sum()
         if refused:
             parts.append(f"{refused} of {len(viewpoints)} stations are out of the robot's reach")
+    if not parts and task.study.requirements.max_tour is not None:
+        return f"requirements.max_tour: {_shortest(problem)}"
     if not parts:
-        longest = task.study.requirements.max_tour
-        parts.append(
-            "some points are seen under nearly parallel rays"
-            if longest is None
-            else f"the tour is longer than requirements.max_tour = {longest}"
-        )
+        parts.append("some points are seen under nearly parallel rays")
     return f"no admissible network among {state.evaluations[-1]} evaluated; of the nearest one " + ", ".join(parts)
+
+
+def _shortest(problem: Problem) -> str:
+    """What the tour takes at least: the same search without the limit."""
+    study = problem.task.study
+    free = without_tour_limit(problem)
+    found = search(free, study.search.engine, study.search.population, study.search.generations, study.seed)
+    asked = f"no admissible network with a tour of at most {study.requirements.max_tour:g}"
+    objectives = found.archive.members.objectives
+    if not len(objectives):
+        return f"{asked}, and none with a longer one"
+    best = objectives[np.argmin(objectives[:, 1])]
+    unit, scale = {"workspace": ("mm", 1e3), "joint": ("rad", 1.0), "time": ("s", 1.0)}[study.motion]
+    return (
+        f"{asked} {unit}; the shortest one found takes {round_up(scale * best[1]):g} {unit} with {int(best[2])} images"
+    )

@@ -23,9 +23,9 @@ NOISE_STEP = np.radians(2.0)  # cells of the table of sigmas: they change slowly
 
 
 def datum_gauge(task: Task) -> Floats | None:
-    """The points' datum defect when f1 is the total mean variance; the worst point is searched with the limited one."""
+    """The points' datum defect unless f1 is limited; the worst point is searched with limited propagation."""
     objectives = task.study.objectives
-    if objectives.propagation != "total" or objectives.precision != "mean_variance":
+    if objectives.propagation == "limited" or objectives.precision != "mean_variance":
         return None
     return inner_basis(task.scene.targets.points)
 

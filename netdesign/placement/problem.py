@@ -14,7 +14,8 @@ from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
 from netdesign.photogrammetry.precision import sighting_sigma
-from netdesign.photogrammetry.total_trace import total_trace
+from netdesign.photogrammetry.total_trace import block_trace, total_trace
+from netdesign.placement.distances import named_ends
 from netdesign.placement.encoding import LARGEST_STEP, SMALLEST_STEP, Chromosomes
 from netdesign.placement.evaluation import (
     JointTables,
@@ -49,7 +50,7 @@ class Problem:
         chromosomes: the encoding and its operators.  visibility: what is seen from where.
         joint_map: joints for every viewpoint, None when motion is measured in the workspace.
         tables, joint: what the kernels read.  cover: the smallest set cover found.
-        gauge: (3m, 7) of ``datum.inner_basis`` when the criterion is the total mean variance, else None.
+        gauge: (3m, 7) of ``datum.inner_basis`` when the criterion is the total or block mean variance, else None.
         scale: (2, 3) ideal and reference point of the normalised objectives (log f1, f2, f3).
         threads: evaluation threads; they do not change any result.
     """
@@ -70,8 +71,10 @@ class Problem:
         """Prepare a study: visibility map, joint map, set cover.
 
         Raises:
+            InputError: [requirements] names a distance between points that do not exist.
             InfeasibleError: some tag can be seen from nowhere, or no station the robot reaches sees enough.
         """
+        named_ends(task)
         progress("visibility map", 0, 3)
         visibility = VisibilityMap.build(task.scene, task.camera, task.sphere, task.limits)
         progress("joint map", 1, 3)
@@ -120,10 +123,10 @@ class Problem:
 
             self._share_out(part, range(0, len(bits), CHUNK))
         if self.gauge is not None:
-            self._propagate_totally(bits, genes, objectives, violation)
+            self._propagate_further(bits, genes, objectives, violation)
 
-    def _propagate_totally(self, bits: Bools, genes: Floats, objectives: Floats, violation: Floats) -> None:
-        """Replace f1 of the feasible rows by total error propagation; what it cannot determine becomes infeasible."""
+    def _propagate_further(self, bits: Bools, genes: Floats, objectives: Floats, violation: Floats) -> None:
+        """Replace f1 of the feasible rows by total or block propagation; what is not determined becomes infeasible."""
         task = self.task
         points, intrinsics = task.scene.targets.points, task.camera.intrinsics
         for row in np.flatnonzero(violation <= 0).tolist():
@@ -133,7 +136,10 @@ class Problem:
             sigma = np.array([[task.camera.sigma_px]])
             if task.camera.corner_noise is not None:
                 sigma = sighting_sigma(task.camera, poses, task.scene.targets)
-            trace = total_trace(poses, points, intrinsics, visible, sigma, self.gauge)
+            if task.study.objectives.propagation == "block":
+                trace = block_trace(poses, points, intrinsics, visible, sigma)
+            else:
+                trace = total_trace(poses, points, intrinsics, visible, sigma, self.gauge)
             objectives[row, 0] = trace / (3 * len(points))
             violation[row] = 0.0 if np.isfinite(trace) else 0.5
 

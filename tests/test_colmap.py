@@ -62,8 +62,11 @@ def test_same_model_same_bytes(tmp_path):
     [
         ("cameras.txt", "OPENCV", "FISHEYE", "camera model"),
         ("cameras.txt", "1 OPENCV 2448", "1 OPENCV x", "numbers"),
-        ("images.txt", "a.png", "", "COLMAP"),
-        ("points3D.txt", "\n3 ", "\nthree ", "COLMAP"),
+        ("cameras.txt", " 3610 ", " -1 ", "positive size and focal length"),
+        ("images.txt", "a.png", "", r"images\.txt:5: expected IMAGE_ID, .* found 9 words"),
+        ("images.txt", " 1 a.png", " 8 a.png", r"images\.txt:5: camera 8 of image a\.png is not in cameras\.txt"),
+        ("points3D.txt", "\n3 ", "\nthree ", r"points3D\.txt:4: expected POINT3D_ID x y z"),
+        ("points3D.txt", "\n3 ", "\n4 ", "point 3 of image a.png is not in points3D.txt"),
     ],
 )
 def test_malformed_models_are_one_line(tmp_path, file, old, new, says):
@@ -79,3 +82,42 @@ def test_malformed_models_are_one_line(tmp_path, file, old, new, says):
 def test_missing_file(tmp_path):
     with pytest.raises(InputError, match=r"cameras\.txt"):
         read_model(tmp_path)
+
+
+def test_our_reading_is_pycolmaps(tmp_path):
+    write_model(tmp_path, model())
+    reconstruction, found = pycolmap.Reconstruction(str(tmp_path)), read_model(tmp_path)
+    for index, name in enumerate(found.names):
+        image = next(image for image in reconstruction.images.values() if image.name == name)
+        np.testing.assert_allclose(
+            found.world_from_cam[index, :3, 3] * 1000, image.projection_center(), rtol=0, atol=1e-10
+        )
+        rows = found.image == index
+        np.testing.assert_array_equal(found.xy_px[rows] + 0.5, [p.xy for p in image.points2D])
+        ids = np.array(found.point_ids)[found.point[rows]]
+        np.testing.assert_array_equal(ids, [p.point3D_id for p in image.points2D])
+
+
+def test_what_other_programs_write(tmp_path):
+    """Windows line ends, comments anywhere, blanks and folders in names, POINTS2D left out, big ids, unused cameras."""
+    (tmp_path / "cameras.txt").write_bytes(
+        b"# comment\r\n\r\n12 SIMPLE_RADIAL 640 480 500 320 240 0.01\r\n7 PINHOLE 640 480 500 510 320 240\r\n"
+        b"3 RADIAL 640 480 600 320 240 0.1 0.02\r\n"
+    )
+    head = "0 0 0 1 2 3"
+    (tmp_path / "images.txt").write_bytes(
+        (
+            f"# images\r\n30 1 {head} 12 dir one/bild 2.jpg\r\n10 20 1000001 11 21 -1 1 2 18446744073709551615\r\n"
+            f"# another\r\n20 1 {head} 7 ü.jpg\r\n5 1 {head} 12 a.jpg\r\n\r\n6 2 {head} 12 1 2 3\r\n"
+            "  7 8 5   9 9 1000001\r\n"
+        ).encode()
+    )
+    (tmp_path / "points3D.txt").write_text("1000001 1 2 3\n5 4 5 6 255 255 255 0.5 1 0 2 0\n")
+    found = read_model(tmp_path)
+    assert found.names == ("1 2 3", "a.jpg", "dir one/bild 2.jpg", "ü.jpg")
+    assert found.camera_ids == (7, 12)
+    assert found.camera_of_image.tolist() == [1, 1, 1, 0]
+    assert found.point_ids == (5, 1000001)
+    assert list(zip(found.image.tolist(), found.point.tolist(), strict=True)) == [(0, 0), (0, 1), (2, 1)]
+    np.testing.assert_allclose(found.xy_px, np.array([[7, 8], [9, 9], [10, 20]]) - 0.5)
+    np.testing.assert_allclose(found.cameras[1].intrinsics, [500, 500, 319.5, 239.5, 0.01, 0, 0, 0])

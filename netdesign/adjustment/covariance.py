@@ -45,30 +45,27 @@ def datum_covariance(
         g_camera: (W, d), g_points: (3m, d): what is open.  operator: (d, 3m), A above.
     """
     count = len(layout.eliminated)
-    coupling = reduced.coupling.copy()
-    kept = np.flatnonzero(layout.kept)
-    for axis in range(3):
-        coupling[3 * kept + axis, layout.kept_start[kept] + axis] = -1.0
+    coupling = reduced.coupling.with_kept(layout.kept_start)
     inverse = camera_side.inverse
-    moved = coupling - g_points @ (operator @ coupling)
-    spread = moved @ inverse
+    datum_part = coupling.under(operator)  # A B
     operator_blocks = operator.reshape(-1, count, 3).transpose(1, 0, 2)
     weighted = operator_blocks @ reduced.inverse  # (m, d, 3): A D
     inner = np.einsum("mai,mbi->ab", weighted, operator_blocks)  # A D Aᵀ
     g_blocks = g_points.reshape(count, 3, -1)
-    cross = g_blocks @ weighted
+    # (B - G A B) S⁻ (B - G A B)ᵀ + (I - G A) D (I - G A)ᵀ, block by block.
+    spread, product = coupling.spread(inverse, datum_part @ inverse)
+    cross = g_blocks @ (weighted + np.swapaxes(product, 1, 2))
+    inner_all = inner + datum_part @ inverse @ datum_part.T
     points = (
-        np.einsum("mia,mja->mij", spread.reshape(count, 3, -1), moved.reshape(count, 3, -1))
-        + reduced.inverse
-        - cross
-        - np.swapaxes(cross, 1, 2)
-        + np.einsum("mia,ab,mjb->mij", g_blocks, inner, g_blocks)
-    )
-    carry = np.eye(layout.width) + g_camera @ (operator @ coupling)
+        spread + reduced.inverse - cross - np.swapaxes(cross, 1, 2)
+        + np.einsum("mia,ab,mjb->mij", g_blocks, inner_all, g_blocks, optimize=True)
+    )  # fmt: skip
+    carry = np.eye(layout.width) + g_camera @ datum_part
     camera = carry @ inverse @ carry.T + g_camera @ inner @ g_camera.T
     joint = None
     if with_joint:
-        joint = spread @ moved.T
+        moved = coupling.dense() - g_points @ datum_part
+        joint = moved @ inverse @ moved.T
         index = np.arange(count)
         joint.reshape(count, 3, count, 3)[index, :, index, :] += reduced.inverse
         left = g_points @ weighted.transpose(1, 0, 2).reshape(-1, 3 * count)

@@ -248,7 +248,7 @@ def _step(
         except LinAlgError:
             step = np.linalg.lstsq(matrix, right, rcond=1e-13)[0]
     step = step * scale
-    coupled = (reduced.coupling @ step).reshape(-1, 3)
+    coupled = reduced.coupling.times(step)
     direct = np.einsum("mij,mj->mi", reduced.inverse, reduced.point_rhs)
     # Newton decrement: rhsᵀ N⁻¹ rhs of the whole system, points and camera side.
     decrement = float(reduced.camera_rhs @ step + (reduced.point_rhs * direct).sum())

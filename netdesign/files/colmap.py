@@ -1,19 +1,20 @@
-"""COLMAP text models: the only file that meets pycolmap.
+"""COLMAP text models: the only file that meets pycolmap, which writes them; ``colmap_text`` reads.
 
 Two conventions are converted here and nowhere else: COLMAP's pixel origin (top-left pixel centre at (0.5, 0.5)) to ours
 (0, 0), and cam_from_world to world_from_cam. Lengths in the files are mm, inside they are metres.
 """
 
-import contextlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from scipy.spatial.transform import Rotation
 
 from netdesign.errors import InputError
+from netdesign.files.colmap_text import CameraLine, ImageLine, read_cameras, read_images, read_points
 from netdesign.files.store import write_bytes
 from netdesign.model.arrays import Floats, Ints, frozen
 from netdesign.model.camera import Camera
@@ -106,8 +107,11 @@ def write_model(folder: Path, model: ColmapModel) -> None:
             write_bytes(folder / path.name, path.read_bytes())
 
 
-def read_model(folder: Path) -> ColmapModel:
+def read_model(folder: Path, with_points2d: bool = True) -> ColmapModel:
     """Read a COLMAP text model.
+
+    Args:
+        with_points2d: False leaves the image points out; their POINT3D_IDs need not exist then.
 
     Raises:
         InputError: a file is missing or malformed, or a camera model is not one of ``PARAMETERS``.
@@ -115,81 +119,60 @@ def read_model(folder: Path) -> ColmapModel:
     for name in MODEL_FILES:
         if not (folder / name).is_file():
             raise InputError(f"{folder}: expected a COLMAP text model, found no {name}")
-    _check_cameras(folder / "cameras.txt")
-    reconstruction = pycolmap.Reconstruction()
-    with _quiet():
-        try:
-            reconstruction.read_text(str(folder))
-        except (RuntimeError, ValueError, IndexError, OverflowError) as error:
-            reason = " ".join(str(error).split())
-            raise InputError(f"{folder}: expected a COLMAP text model, COLMAP says: {reason}") from None
-    camera_ids = tuple(sorted(reconstruction.cameras))
-    images = sorted(reconstruction.images.values(), key=lambda image: image.name)
-    point_ids = tuple(sorted(reconstruction.points3D))
-    row_of_point = {point_id: row for row, point_id in enumerate(point_ids)}
-    rows = [
-        (index, row_of_point[point2d.point3D_id], *point2d.xy)
-        for index, image in enumerate(images)
-        for point2d in image.points2D
-        if point2d.has_point3D()
-    ]
-    observed = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    cam_from_world = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
-    placed = pose(cam_from_world[:, :, :3], cam_from_world[:, :, 3] * MM)
+    counts = {name: 1 + max(index for index in row if index is not None) for name, row in PARAMETERS.items()}
+    cameras = {line.camera_id: line for line in read_cameras(folder / "cameras.txt", counts)}
+    images = sorted(read_images(folder / "images.txt"), key=lambda image: image.name)
+    for image in images:
+        if image.camera_id not in cameras:
+            raise InputError(f"{image.where}: camera {image.camera_id} of image {image.name} is not in cameras.txt")
+    # A camera that took no image has nothing to be adjusted from.
+    used = sorted({image.camera_id for image in images})
+    point_ids, points = read_points(folder / "points3D.txt")
+    image_index, point_index, xy = _image_points(images if with_points2d else [], point_ids)
+    quaternion = np.array([image.quaternion for image in images]).reshape(-1, 4)
+    translation = np.array([image.translation for image in images]).reshape(-1, 3)
+    rotation = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_matrix() if images else np.zeros((0, 3, 3))
     return ColmapModel(
-        cameras=tuple(_camera(reconstruction.cameras[camera_id]) for camera_id in camera_ids),
-        camera_ids=camera_ids,
-        camera_of_image=np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
+        cameras=tuple(_camera(cameras[camera_id]) for camera_id in used),
+        camera_ids=tuple(used),
+        camera_of_image=np.array([used.index(image.camera_id) for image in images], dtype=np.int64),
         names=tuple(image.name for image in images),
-        world_from_cam=inverse(placed),
-        point_ids=point_ids,
-        points=np.array([reconstruction.points3D[point_id].xyz for point_id in point_ids]).reshape(-1, 3) * MM,
-        image=observed[:, 0].astype(np.int64),
-        point=observed[:, 1].astype(np.int64),
-        xy_px=observed[:, 2:] - PIXEL_ORIGIN,
+        world_from_cam=inverse(pose(rotation, translation * MM)),
+        point_ids=tuple(point_ids.tolist()),
+        points=points * MM,
+        image=image_index,
+        point=point_index,
+        xy_px=xy - PIXEL_ORIGIN,
     )
 
 
-def _camera(camera: pycolmap.Camera) -> Camera:
-    """Return our camera of a COLMAP one whose model has been checked."""
+def _image_points(images: Sequence[ImageLine], point_ids: Ints) -> tuple[Ints, Ints, Floats]:
+    """Return image index (k,), point index (k,) and coordinates (k, 2) of all POINTS2D.
+
+    Raises:
+        InputError: an image point of an object point that is not in points3D.txt.
+    """
+    if not images:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 2))
+    image = np.repeat(np.arange(len(images)), [len(line.point_id) for line in images])
+    wanted = np.concatenate([line.point_id for line in images])
+    row = np.searchsorted(point_ids, wanted)
+    missing = np.flatnonzero(~np.isin(wanted, point_ids))
+    if len(missing):
+        line = images[int(image[missing[0]])]
+        raise InputError(f"{line.where}: point {wanted[missing[0]]} of image {line.name} is not in points3D.txt")
+    return image, row.astype(np.int64), np.concatenate([line.xy for line in images])
+
+
+def _camera(line: CameraLine) -> Camera:
+    """Return our camera of a COLMAP one."""
     fx, fy, cx, cy, *distortion = (
-        0.0 if index is None else float(camera.params[index]) for index in PARAMETERS[camera.model.name]
+        0.0 if index is None else line.parameters[index] for index in PARAMETERS[line.model]
     )
     return Camera(
-        width_px=camera.width,
-        height_px=camera.height,
+        width_px=line.size[0],
+        height_px=line.size[1],
         focal_px=np.array([fx, fy]),
         principal_point_px=np.array([cx, cy]) - PIXEL_ORIGIN,
         distortion=np.array(distortion),
     )
-
-
-def _check_cameras(path: Path) -> None:
-    """Raise InputError for a camera line that COLMAP would answer by ending the process."""
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        known = ", ".join(PARAMETERS)
-        if len(words) < 2 or words[1] not in PARAMETERS:
-            raise InputError(f"{path}:{number}: expected a camera model of {known}, found {' '.join(words[1:2])!r}")
-        expected = 1 + max(index for index in PARAMETERS[words[1]] if index is not None)
-        try:
-            values = [float(word) for word in words[2:]]
-        except ValueError:
-            values = []
-        if len(values) != 2 + expected or not np.isfinite(values).all():
-            raise InputError(f"{path}:{number}: expected width, height and {expected} numbers, found {line.strip()!r}")
-        if values[0] <= 0 or values[1] <= 0 or values[2] <= 0:
-            raise InputError(f"{path}:{number}: expected a positive size and focal length, found {line.strip()!r}")
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep COLMAP's own log off the user's terminal."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level

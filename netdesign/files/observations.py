@@ -54,16 +54,14 @@ def read_observation_set(folder: Path, sigma_px: float | None) -> ObservationSet
     """
     if sigma_px is not None and not (np.isfinite(sigma_px) and sigma_px > 0):
         raise InputError(f"sigma_px: expected a positive number, found {sigma_px}")
-    if (folder / "images.txt").is_file():
-        _check_finite(folder / "images.txt")
-    model = read_model(folder)
+    path = folder / "observations.csv"
+    model = read_model(folder, with_points2d=not path.is_file())
     for what, count in (("image", len(model.names)), ("point", len(model.point_ids))):
         if count == 0:
             raise InputError(f"{folder}: expected a COLMAP model with {what}s, found none")
     repeated = sorted({name for name in model.names if model.names.count(name) > 1})
     if repeated:
         raise InputError(f"{folder / 'images.txt'}: expected unique image names, found {repeated[0]} twice")
-    path = folder / "observations.csv"
     variance = (DEFAULT_SIGMA_PX if sigma_px is None else sigma_px) ** 2
     if path.is_file():
         observations, known = _read_observations(path, model.names, model.point_ids, variance, sigma_px is not None)
@@ -87,20 +85,6 @@ def read_observation_set(folder: Path, sigma_px: float | None) -> ObservationSet
         observations=observations,
         sigma_known=known,
     )
-
-
-def _check_finite(path: Path) -> None:
-    """Raise InputError for NaN or infinity in images.txt, with the line: COLMAP's own message names nothing."""
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
-        if line.startswith("#"):
-            continue
-        for word in line.split():
-            try:
-                finite = np.isfinite(float(word))
-            except ValueError:
-                break  # an image name, or something that COLMAP will refuse
-            if not finite:
-                raise InputError(f"{path}:{number}: expected finite numbers, found {word}")
 
 
 def csv_rows(path: Path, required: Sequence[str]) -> list[tuple[str, dict[str, str]]]:

@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 
 from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.photogrammetry.coupling import Coupling
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,14 +53,14 @@ class Reduced:
     """The reduced normal equations.
 
     Attributes:
-        inverse: D (m, 3, 3), zero for points that are not eliminated.  coupling: B (3m, W).
+        inverse: D (m, 3, 3), zero for points that are not eliminated.  coupling: B (3m, W), zero for the same points.
         schur: S (W, W).  diagonal: (W,) of N_cc, the natural scale of the camera side.
         point_rhs: (m, 3).  camera_rhs: (W,) already reduced.
         point_condition: (m,) smallest over largest eigenvalue of N_pp, 1 for points that are not eliminated.
     """
 
     inverse: Floats
-    coupling: Floats
+    coupling: Coupling
     schur: Floats
     diagonal: Floats
     point_rhs: Floats
@@ -77,13 +78,13 @@ def reduce_normals(linearised: Linearised, damping: float = 0.0) -> Reduced:
     start = np.searchsorted(linearised.point[order], np.arange(count + 1))
     point_part = np.where(linearised.eliminated[linearised.point][:, None, None], linearised.point_part, 0.0)
     npp = linearised.point_prior.copy()
-    np.add.at(npp, linearised.point, np.einsum("kri,krj->kij", point_part, point_part))
     rhs = linearised.point_prior_rhs.copy()
-    np.add.at(rhs, linearised.point, np.einsum("kri,kr->ki", point_part, linearised.residual))
+    _add_points(linearised.point, point_part, linearised.residual, npp, rhs)
     npp[:, range(3), range(3)] *= 1.0 + damping
     inverse, condition = _inverse3(npp, linearised.eliminated)
-    schur, coupling, camera_rhs, diagonal = _eliminate(
+    schur, entries, column, value, camera_rhs, diagonal = _eliminate(
         start.astype(np.int64),
+        linearised.eliminated,
         linearised.columns[order],
         linearised.camera[order],
         point_part[order],
@@ -97,7 +98,7 @@ def reduce_normals(linearised: Linearised, damping: float = 0.0) -> Reduced:
     schur[range(linearised.width), range(linearised.width)] += damping * diagonal
     return Reduced(
         inverse=inverse,
-        coupling=coupling,
+        coupling=Coupling(start=entries, column=column, value=value, width=linearised.width),
         schur=schur,
         diagonal=diagonal,
         point_rhs=rhs,
@@ -123,8 +124,23 @@ def _inverse3(npp: Floats, eliminated: Bools) -> tuple[Floats, Floats]:
 
 
 @njit(cache=True, error_model="numpy")
+def _add_points(
+    point: Ints, point_part: Floats, residual: Floats, npp: Floats, rhs: Floats
+) -> None:  # pragma: no cover - compiled
+    """Add the image points' normal equations to those of the points."""
+    for k in range(point.shape[0]):
+        p = point[k]
+        for i in range(3):
+            for row in range(2):
+                rhs[p, i] += point_part[k, row, i] * residual[k, row]
+                for j in range(3):
+                    npp[p, i, j] += point_part[k, row, i] * point_part[k, row, j]
+
+
+@njit(cache=True, error_model="numpy")
 def _eliminate(
     start: Ints,
+    eliminated: Bools,
     columns: Ints,
     camera: Floats,
     point_part: Floats,
@@ -132,29 +148,30 @@ def _eliminate(
     inverse: Floats,
     point_rhs: Floats,
     width: int,
-) -> tuple[Floats, Floats, Floats, Floats]:  # pragma: no cover - compiled
-    """Return S, B, the reduced right-hand side and diag N_cc; image points are sorted by point."""
+) -> tuple[Floats, Ints, Ints, Floats, Floats, Floats]:  # pragma: no cover - compiled
+    """Return S, B (start, column, value), the reduced right-hand side, diag N_cc; image points are sorted by point."""
     count = start.shape[0] - 1
     slots = columns.shape[1]
     schur = np.zeros((width, width))
-    coupling = np.zeros((3 * count, width))
+    entries = np.zeros(count + 1, dtype=np.int64)
+    column = np.empty(columns.shape[0] * slots, dtype=np.int64)
+    value = np.empty((columns.shape[0] * slots, 3))
     rhs = np.zeros(width)
     diagonal = np.zeros(width)
     cross = np.zeros((width, 3))  # N_pc of the point in hand, transposed
-    solved = np.zeros((width, 3))
-    touched = np.empty(width, dtype=np.int64)
-    is_touched = np.zeros(width, dtype=np.bool_)
+    place = np.full(width, -1, dtype=np.int64)
+    filled = 0
     for point in range(count):
-        used = 0
+        first = filled
         for k in range(start[point], start[point + 1]):
             for a in range(slots):
                 ca = columns[k, a]
                 if ca < 0:
                     continue
-                if not is_touched[ca]:
-                    is_touched[ca] = True
-                    touched[used] = ca
-                    used += 1
+                if eliminated[point] and place[ca] < 0:
+                    place[ca] = filled
+                    column[filled] = ca
+                    filled += 1
                 rhs[ca] += camera[k, 0, a] * residual[k, 0] + camera[k, 1, a] * residual[k, 1]
                 for axis in range(3):
                     cross[ca, axis] += (
@@ -165,28 +182,26 @@ def _eliminate(
                     if cb >= 0:
                         schur[ca, cb] += camera[k, 0, a] * camera[k, 0, b] + camera[k, 1, a] * camera[k, 1, b]
                 diagonal[ca] += camera[k, 0, a] ** 2 + camera[k, 1, a] ** 2
-        for index in range(used):
-            ca = touched[index]
+        for index in range(first, filled):
+            ca = column[index]
             for axis in range(3):
-                value = 0.0
+                product = 0.0
                 for other in range(3):
-                    value += inverse[point, axis, other] * cross[ca, other]
-                solved[ca, axis] = value
-                coupling[3 * point + axis, ca] = value
-                rhs[ca] -= value * point_rhs[point, axis]
-        for index in range(used):
-            ca = touched[index]
-            for other in range(used):
-                cb = touched[other]
-                schur[ca, cb] -= (
-                    cross[ca, 0] * solved[cb, 0] + cross[ca, 1] * solved[cb, 1] + cross[ca, 2] * solved[cb, 2]
+                    product += inverse[point, axis, other] * cross[ca, other]
+                value[index, axis] = product
+                rhs[ca] -= product * point_rhs[point, axis]
+        for index in range(first, filled):
+            ca = column[index]
+            for other in range(first, filled):
+                schur[ca, column[other]] -= (
+                    cross[ca, 0] * value[other, 0] + cross[ca, 1] * value[other, 1] + cross[ca, 2] * value[other, 2]
                 )
-        for index in range(used):
-            ca = touched[index]
-            is_touched[ca] = False
+        for index in range(first, filled):
+            place[column[index]] = -1
             for axis in range(3):
-                cross[ca, axis] = 0.0
-    return 0.5 * (schur + schur.T), coupling, rhs, diagonal
+                cross[column[index], axis] = 0.0
+        entries[point + 1] = filled
+    return 0.5 * (schur + schur.T), entries, column[:filled].copy(), value[:filled].copy(), rhs, diagonal
 
 
 @dataclass(frozen=True, kw_only=True)

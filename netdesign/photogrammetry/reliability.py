@@ -31,7 +31,9 @@ def redundancy_matrices(linearised: Linearised, reduced: Reduced, camera_inverse
             np.where(linearised.eliminated[linearised.point][:, None, None], linearised.point_part, 0.0),
             linearised.point,
             reduced.inverse,
-            reduced.coupling,
+            reduced.coupling.start,
+            reduced.coupling.column,
+            reduced.coupling.value,
             np.ascontiguousarray(camera_inverse),
         )
     )
@@ -44,58 +46,56 @@ def _redundancy(
     point_part: Floats,
     point: Ints,
     inverse: Floats,
-    coupling: Floats,
+    start: Ints,
+    column: Ints,
+    value: Floats,
     camera_inverse: Floats,
-) -> Floats:
+) -> Floats:  # pragma: no cover - compiled
     """E has entries at every camera-side unknown that the point's other images touch: gather those."""
     count, slots = columns.shape
     width = camera_inverse.shape[0]
     result = np.zeros((count, 2, 2))
-    effect = np.zeros((2, width))
+    place = np.full(width, -1, dtype=np.int64)
     touched = np.empty(width, dtype=np.int64)
+    effect = np.zeros((2, width))  # by place in ``touched``
     for k in range(count):
-        p = 3 * point[k]
+        p = point[k]
         used = 0
-        for c in range(width):
-            b0, b1, b2 = coupling[p, c], coupling[p + 1, c], coupling[p + 2, c]
-            if b0 != 0.0 or b1 != 0.0 or b2 != 0.0:
-                touched[used] = c
-                used += 1
-                for row in range(2):
-                    effect[row, c] = -(
-                        point_part[k, row, 0] * b0 + point_part[k, row, 1] * b1 + point_part[k, row, 2] * b2
-                    )
+        for e in range(start[p], start[p + 1]):
+            place[column[e]] = used
+            touched[used] = column[e]
+            for row in range(2):
+                effect[row, used] = -(
+                    point_part[k, row, 0] * value[e, 0]
+                    + point_part[k, row, 1] * value[e, 1]
+                    + point_part[k, row, 2] * value[e, 2]
+                )
+            used += 1
         for a in range(slots):
             c = columns[k, a]
             if c < 0:
                 continue
-            if effect[0, c] == 0.0 and effect[1, c] == 0.0:
-                known = False
-                for other in range(used):
-                    if touched[other] == c:
-                        known = True
-                if not known:
-                    touched[used] = c
-                    used += 1
-            effect[0, c] += camera[k, 0, a]
-            effect[1, c] += camera[k, 1, a]
+            if place[c] < 0:
+                place[c] = used
+                touched[used] = c
+                effect[0, used] = effect[1, used] = 0.0
+                used += 1
+            effect[0, place[c]] += camera[k, 0, a]
+            effect[1, place[c]] += camera[k, 1, a]
         h00 = h01 = h11 = 0.0
         for a in range(used):
-            ca = touched[a]
             s0 = s1 = 0.0
             for b in range(used):
-                cb = touched[b]
-                s0 += camera_inverse[ca, cb] * effect[0, cb]
-                s1 += camera_inverse[ca, cb] * effect[1, cb]
-            h00 += effect[0, ca] * s0
-            h01 += effect[0, ca] * s1
-            h11 += effect[1, ca] * s1
-        for a in range(used):
-            effect[0, touched[a]] = 0.0
-            effect[1, touched[a]] = 0.0
+                element = camera_inverse[touched[a], touched[b]]
+                s0 += element * effect[0, b]
+                s1 += element * effect[1, b]
+            h00 += effect[0, a] * s0
+            h01 += effect[0, a] * s1
+            h11 += effect[1, a] * s1
+            place[touched[a]] = -1
         for a in range(3):
             for b in range(3):
-                d = inverse[point[k], a, b]
+                d = inverse[p, a, b]
                 h00 += point_part[k, 0, a] * d * point_part[k, 0, b]
                 h01 += point_part[k, 0, a] * d * point_part[k, 1, b]
                 h11 += point_part[k, 1, a] * d * point_part[k, 1, b]

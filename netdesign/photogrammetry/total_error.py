@@ -90,7 +90,8 @@ class TotalError:
 
 def joint_covariance(reduced: Reduced, camera_inverse: Floats, basis: Floats) -> Floats:
     """Return P (D + B S⁻ Bᵀ) P (3m, 3m), P = I - basis basisᵀ."""
-    covariance = reduced.coupling @ camera_inverse @ reduced.coupling.T
+    coupling = reduced.coupling.dense()
+    covariance = coupling @ camera_inverse @ coupling.T
     count = len(reduced.inverse)
     index = np.arange(count)
     covariance.reshape(count, 3, count, 3)[index, :, index, :] += reduced.inverse
@@ -104,7 +105,7 @@ def block_covariance(reduced: Reduced, camera_inverse: Floats, basis: Floats) ->
     count = len(reduced.inverse)
     q = basis.reshape(count, 3, -1)
     # P B S⁻ Bᵀ P: project B first; P D P block by block: D - q qᵀD - D q qᵀ + q (QᵀDQ) qᵀ.
-    projected = (reduced.coupling - basis @ (basis.T @ reduced.coupling)).reshape(count, 3, -1)
+    projected = (reduced.coupling.dense() - basis @ reduced.coupling.under(basis.T)).reshape(count, 3, -1)
     spread = (projected.reshape(3 * count, -1) @ camera_inverse).reshape(count, 3, -1)
     result = np.einsum("mia,mja->mij", spread, projected)
     dq = reduced.inverse @ q
@@ -201,7 +202,7 @@ def _flags(
         return flags
     count, images = len(total.rays), visible.shape[0]
     spread = np.trace(total.covariance, axis1=1, axis2=2) - np.trace(total.limited, axis1=1, axis2=2)
-    projected = total.reduced.coupling - total.basis @ (total.basis.T @ total.reduced.coupling)
+    projected = total.reduced.coupling.dense() - total.basis @ total.reduced.coupling.under(total.basis.T)
     # S⁻ in the inner-constraint datum is not needed: P B makes the product independent of the datum. What image i
     # causes is the part of trace(P B S⁻ Bᵀ P) in its six columns.
     caused = np.einsum("pw,pw->w", projected @ total.camera_side.inverse, projected)[: 6 * images]

@@ -4,6 +4,7 @@ Robust weights are Cauchy's, w = 1 / (1 + |e|²/c²) with c = 2.3849 on the whit
 They serve as a start only: a covariance from robust weights is none, see ``estimate``.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,8 +20,16 @@ from netdesign.photogrammetry.observation_equations import Layout, linearise, wh
 
 CAUCHY = 2.3849
 MOST_ITERATIONS = 200
+FIRST_DAMPING = 1e-6
 CLOSE = 1e-3  # length of a step, in standard deviations, from which on the cost no longer judges it
 STEP = 1e-7  # length of the last Gauss-Newton step, in standard deviations of all unknowns together
+
+
+Iterations = Callable[[int, float], None]
+
+
+def unseen(iteration: int, cost: float) -> None:
+    """Show nothing: the default."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,8 +164,11 @@ def _total(squared: Floats, extra: float, robust: bool) -> float:
     return float(squared.sum()) + extra
 
 
-def solve(problem: BundleProblem, robust: bool = False) -> Solution:
+def solve(problem: BundleProblem, robust: bool = False, progress: Iterations = unseen) -> Solution:
     """Return the least-squares (or Cauchy) solution.
+
+    Args:
+        progress: told the iteration and the cost before each one.
 
     Raises:
         InfeasibleError: the iteration does not converge.
@@ -164,11 +176,13 @@ def solve(problem: BundleProblem, robust: bool = False) -> Solution:
     layout = problem.layout()
     whiten = whitener(problem.observations.covariance)
     squared, extra, _ = cost_parts(problem, whiten)
-    cost, damping, decrement = _total(squared, extra, robust), 1e-6, np.inf
-    polished = 0
+    cost, damping, raise_by, decrement = _total(squared, extra, robust), FIRST_DAMPING, 4.0, np.inf
+    polished, linearised, rows = 0, None, np.zeros((0, layout.width + 1))
     for iteration in range(1, MOST_ITERATIONS + 1):
-        weights = np.sqrt(robust_weights(squared)) if robust else np.ones(len(squared))
-        linearised, rows = equations(problem, layout, whiten * weights[:, None, None])
+        progress(iteration, cost)
+        if linearised is None:
+            weights = np.sqrt(robust_weights(squared)) if robust else np.ones(len(squared))
+            linearised, rows = equations(problem, layout, whiten * weights[:, None, None])
         step, point_step, decrement = _step(problem, layout, linearised, rows, damping)
         candidate = moved(problem, layout, step, point_step)
         new_squared, new_extra, depth = cost_parts(candidate, whiten)
@@ -176,18 +190,21 @@ def solve(problem: BundleProblem, robust: bool = False) -> Solution:
         misclosed = len(rows) > 0 and np.abs(rows[:, -1]).max() > 1e-12
         if decrement < CLOSE and not misclosed:
             # So close the change of the cost drowns in rounding: plain Gauss-Newton steps, judged by their length.
-            if damping > 1e-2:
-                damping = 0.0  # a heavily damped step is short whatever the distance to the minimum: look again
+            if damping > 0.0:
+                damping = 0.0  # a damped step may be short far from the minimum: look again
                 continue
-            problem, squared, cost, extra = candidate, new_squared, new_cost, new_extra
+            problem, squared, cost, extra, linearised = candidate, new_squared, new_cost, new_extra, None
             polished += 1
             if decrement < STEP * (1e3 if robust else 1.0) or polished >= 10:
                 return solution_at(problem, iteration)
         elif (depth > 0).all() and (new_cost <= cost or misclosed):
-            problem, squared, cost, extra = candidate, new_squared, new_cost, new_extra
-            damping = damping * 0.1 if damping > 1e-9 else 0.0
+            # H. B. Nielsen's rule: the damping falls as far as the linear model keeps its promise.
+            gain = 1.0 if misclosed else (cost - new_cost) / max(decrement**2, 1e-300)
+            damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3) if gain < 1.0 else 0.1
+            damping, raise_by = damping if damping > 1e-12 else 0.0, 4.0
+            problem, squared, cost, extra, linearised = candidate, new_squared, new_cost, new_extra, None
         else:
-            damping = max(damping * 10.0, 1e-6)
+            damping, raise_by = max(damping, 1e-10) * raise_by, 2.0 * raise_by
         if damping > 1e12:
             break
     raise InfeasibleError(

@@ -100,7 +100,7 @@ def tie_flags(visible: Bools, image_names: Sequence[str]) -> tuple[str, ...]:
     """
     if len(visible) < 3:
         return ()
-    strong = visible[:, visible.sum(axis=0) >= 3].astype(np.int64)
+    strong = visible[:, visible.sum(axis=0) >= 3].astype(np.float32)
     common = strong @ strong.T
     _, label = connected_components(common >= MIN_COMMON_POINTS, directed=False)
     if label.max(initial=0) == 0:

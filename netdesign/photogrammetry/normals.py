@@ -210,7 +210,7 @@ class CameraSide:
 
     Attributes:
         inverse: a g-inverse S⁻ (W, W), or the inverse when nothing is open.
-        eigenvalues: (W,) ascending, of S with unit N_cc diagonal (Jacobi scaling).
+        eigenvalues: ascending, of S with unit N_cc diagonal (Jacobi scaling), the datum's zeros raised to 1.
         null_vectors: (W, d') directions that the measurements do not determine besides the datum, scaled to unit
             length in units of each unknown's own standard deviation; d' = 0 for a healthy network.
         defect: number of datum parameters that are open by design.
@@ -229,7 +229,7 @@ class CameraSide:
     @property
     def first_eigenvalue(self) -> float:
         """The smallest eigenvalue that the datum does not explain: lambda8 of a free network."""
-        return float(self.eigenvalues[self.defect]) if len(self.eigenvalues) > self.defect else float("inf")
+        return float(self.eigenvalues[0]) if len(self.eigenvalues) > self.defect else float("inf")
 
 
 RANK_TOLERANCE = 1e-12
@@ -258,11 +258,9 @@ def invert_camera_side(reduced: Reduced, null_space: Floats, constraints: Floats
     scaled = free.T @ scaled @ free
     basis = np.linalg.qr(free.T @ gauge)[0] if gauge.shape[1] else np.zeros((free.shape[1], 0))
     scaled = 0.5 * (scaled + scaled.T)
-    eigenvalues = np.linalg.eigvalsh(scaled) if len(scaled) else np.zeros(0)
-    bordered_values, vectors = np.linalg.eigh(scaled + basis @ basis.T)
-    tolerance = RANK_TOLERANCE * max(float(bordered_values[-1]), 1.0)
-    open_ = bordered_values < tolerance
-    weights = np.where(open_, 0.0, 1.0 / np.where(open_, 1.0, bordered_values))
+    eigenvalues, vectors = np.linalg.eigh(scaled + basis @ basis.T)
+    open_ = eigenvalues < RANK_TOLERANCE * max(float(eigenvalues[-1]), 1.0)
+    weights = np.where(open_, 0.0, 1.0 / np.where(open_, 1.0, eigenvalues))
     inverse = (vectors * weights) @ vectors.T
     if not open_.any():
         # One Newton step: the eigen-decomposition loses digits that the inverse can keep.

@@ -89,7 +89,9 @@ def aerial(images=5, count=80, sigma=0.3, seed=0, offset=(512_000.0, 5_340_000.0
     per = int(np.ceil(images / strips))
     x, y = np.meshgrid(260.0 * np.arange(per), 320.0 * np.arange(strips))
     centre = np.stack([x.ravel(), y.ravel(), np.full(x.size, 800.0)], 1)[:images] + rng.normal(0, 8, (images, 3))
-    turn = Rotation.from_euler("xyz", np.c_[np.full(images, 180.0), np.zeros((images, 2))] + rng.normal(0, 2, (images, 3)), degrees=True)
+    turn = Rotation.from_euler(
+        "xyz", np.c_[np.full(images, 180.0), np.zeros((images, 2))] + rng.normal(0, 2, (images, 3)), degrees=True
+    )
     poses = np.tile(np.eye(4), (images, 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = turn.as_matrix(), centre
     low, high = centre[:, :2].min(0) - 250, centre[:, :2].max(0) + 250
@@ -103,10 +105,12 @@ def aerial(images=5, count=80, sigma=0.3, seed=0, offset=(512_000.0, 5_340_000.0
     poses[:, :3, 3] += offset
     points = points + offset
     made = observed(poses, points, intrinsics, visible, sigma, seed)
-    spread = [int(np.argmin(((points - points.mean(0)) @ rng.normal(size=3)))) for _ in range(3 * control)]
+    spread = [int(np.argmin((points - points.mean(0)) @ rng.normal(size=3))) for _ in range(3 * control)]
     chosen = np.array(list(dict.fromkeys(spread))[:control])
     level = rng.uniform(0.02, 0.08, len(chosen))
-    return replace(made, control=(chosen, points[chosen] + level[:, None] * rng.standard_normal((len(chosen), 3)), level))
+    return replace(
+        made, control=(chosen, points[chosen] + level[:, None] * rng.standard_normal((len(chosen), 3)), level)
+    )
 
 
 def building(images=40, count=1500, sigma=0.6, seed=0, mean_rays=3.0, offset=(0.0, 0, 0)):
@@ -216,10 +220,10 @@ def write_project(folder, project, points2d=True, csv=False, covariances=True, l
             )
         )
     put("images.txt", lines)
-    put(
-        "points3D.txt",
-        ["# points", *(" ".join([str(i), *map(number, xyz * 1e3), "0 0 0 0"]) for i, xyz in zip(project.ids, project.points, strict=True))],
-    )
+    lines = ["# points"]
+    for number_of, xyz in zip(project.ids, project.points, strict=True):
+        lines.append(" ".join([str(number_of), *map(number, xyz * 1e3), "0 0 0 0"]))
+    put("points3D.txt", lines)
     if csv:
         head = "image,point,x_px,y_px" + (",sxx_px2,sxy_px2,syy_px2" if covariances else "")
         lines = [head]

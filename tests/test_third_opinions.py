@@ -146,7 +146,7 @@ def test_every_datum_equals_the_dense_bordered_solution(kind, refine):
         "weighted control": {"datum": "control", "control": control},
         "fixed control": {"datum": "fixed", "control": control},
         "control and bar": {"datum": "control", "control": control, "bars": bars},
-        "priors": {"datum": "scale", "bars": bars, "priors": priors},
+        "priors": {"datum": "poses", "bars": bars, "priors": priors},
     }[kind]
     start = disturbed(poses, points, seed=3)
     result = estimate(problem_of(observations, *start, refine=refine, **options), joint=True)

@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import K, L, X
 
-from netdesign.adjustment.estimate import anchored, appraise
+from netdesign.adjustment.appraisal import anchored, appraise
 from netdesign.adjustment.problem import BundleProblem, check_input, check_start, null_space
 from netdesign.adjustment.solver import newton_decrement, solution_at
 from netdesign.errors import InfeasibleError

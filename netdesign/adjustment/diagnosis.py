@@ -5,43 +5,74 @@ from scipy.stats import chi2
 
 from netdesign.adjustment.problem import BundleProblem
 from netdesign.model.adjustment import Adjustment
-from netdesign.model.arrays import Floats
+from netdesign.model.arrays import Bools, Floats
 from netdesign.photogrammetry.connectivity import listed, named, tie_flags
 from netdesign.photogrammetry.normals import Reduced
 from netdesign.photogrammetry.observation_equations import Layout
 
 POINT_CONDITION = 1e-9  # of a point's normals: below it its rays are parallel
 HOPELESS_DEPTH = 0.2  # sigma over distance above which a point counts as not determined
-WEAK_DEPTH = 0.01  # sigma over distance above which its ray geometry is named; many such points are a broken network
-WEAK_SHARE = 0.1
+HOPELESS_SHARE = 0.1  # of the points: so many are no stray points, but a network without a base
+HOPELESS_NETWORK = 0.05  # median inner sigma over the object's extent above which nothing is determined
+WEAK_DEPTH = 0.01  # sigma over distance above which its ray geometry is named
 HARDLY_CHECKED = 0.1  # redundancy number below which a gross error hardly shows in the residual
 SHARE_HARDLY_CHECKED = 0.05  # of the image points; a few at the end of a three-ray point are in every network
 CLOSE_BASELINE = 0.01
 CORRELATION = 0.95
-NOT_DETERMINED = 200.0  # effect of a parameter's sigma in the image, in sigmas of one image coordinate
-NOT_DETERMINED_FLAT = 10.0  # the same for a flat object seen without roll, where tilt stands in for the parameter
+# Effects of a parameter's sigma in the image. That it is large is a warning; that it moves the edge of the field by a
+# tenth of its radius is no estimate any more. A flat object seen without roll is singular for the principal point,
+# and only the noise of the estimates hides it: there the sigma that one image point would give is what shows it.
+WEAK_PARAMETER = 100.0  # in sigmas of one image coordinate
+NOT_DETERMINED = 0.1  # of the field's radius
+NOT_DETERMINED_FLAT = 600.0  # in sigmas of one image coordinate, times the root of the number of image points
 ROLL_ALIKE = 0.97  # mean resultant length of the roll angles above which all images are rolled alike
 
 
-def point_complaints(problem: BundleProblem, layout: Layout, reduced: Reduced, weakness: Floats) -> tuple[str, ...]:
-    """Return the points whose rays are parallel, or so nearly parallel that the distance is noise.
-
-    Two images at one position and nothing else is the common cause.
+def undetermined_points(layout: Layout, reduced: Reduced, weakness: Floats) -> Bools:
+    """Return (m,) the points whose rays are so nearly parallel that their distance is noise.
 
     Args:
         weakness: (m,) of ``depth_weakness``.
     """
-    bad = layout.eliminated & ((reduced.point_condition < POINT_CONDITION) | (weakness > HOPELESS_DEPTH))
-    weak = weakness > WEAK_DEPTH
-    if weak.sum() > WEAK_SHARE * layout.eliminated.sum():
-        bad |= weak
-    if not bad.any():
+    parallel = (reduced.point_condition < POINT_CONDITION) | (weakness > HOPELESS_DEPTH)
+    return np.asarray(layout.eliminated & parallel)
+
+
+def point_complaints(problem: BundleProblem, layout: Layout, lost: Bools) -> tuple[str, ...]:
+    """Return a complaint when more than stray points are not determined.
+
+    Two images at one position and nothing else is the common cause.
+    """
+    if lost.sum() <= HOPELESS_SHARE * layout.eliminated.sum():
         return ()
-    images = np.unique(problem.observations.image[bad[problem.observations.point]])
+    images = np.unique(problem.observations.image[lost[problem.observations.point]])
     return (
-        f"{int(bad.sum())} point(s) have (nearly) parallel rays, their distance is not determined: "
-        f"{listed(named(problem.point_names, bad))}; they are seen by images "
+        f"{int(lost.sum())} point(s) have (nearly) parallel rays, their distance is not determined: "
+        f"{listed(named(problem.point_names, lost))}; they are seen by images "
         f"{listed(named(problem.image_names, images))} only, from (nearly) one position",
+        *coinciding_images(problem),
+    )
+
+
+def network_complaints(
+    problem: BundleProblem, layout: Layout, inner: Floats, lost: Bools, noise: float
+) -> tuple[str, ...]:
+    """Return a complaint when the points are known no better than to a share of the object itself.
+
+    Args:
+        inner: (m, 3, 3) covariance over inner constraints, in units of the object's extent.  noise: factor on sigma.
+    """
+    judged = (layout.eliminated | layout.kept) & ~lost
+    if judged.sum() < 3:
+        return ()
+    worst = np.sqrt(np.maximum(np.linalg.eigvalsh(inner[judged])[:, -1], 0.0)) * noise
+    typical = float(np.median(worst))
+    if typical <= HOPELESS_NETWORK:
+        return ()
+    return (
+        f"the network is not determined: half of the points have a sigma above {100 * typical:.0f} % of the object's "
+        "extent",
+        *coinciding_images(problem),
     )
 
 
@@ -125,6 +156,17 @@ def parameter_effect(problem: BundleProblem, sigma: Floats) -> Floats:
     return np.array(effects) * sigma
 
 
+def _field_radius(problem: BundleProblem) -> float:
+    """Return the largest distance of an image point from its principal point, px."""
+    observations = problem.observations
+    centre = problem.intrinsics[problem.camera_of_image[observations.image], 2:4]
+    return float(np.sqrt(((observations.xy_px - centre) ** 2).sum(axis=1).max()))
+
+
+def _noise_px(problem: BundleProblem) -> float:
+    return float(np.sqrt(np.median(problem.observations.covariance[:, [0, 1], [0, 1]])))
+
+
 def calibration_complaints(
     problem: BundleProblem, parameter_names: tuple[str, ...], covariance: Floats | None
 ) -> tuple[str, ...]:
@@ -138,9 +180,13 @@ def calibration_complaints(
     if covariance is None:
         return (_advice(problem)[2:],)
     effect = parameter_effect(problem, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
-    noise = float(np.sqrt(np.median(problem.observations.covariance[:, [0, 1], [0, 1]])))
-    flat = _is_flat(problem.points[np.unique(problem.observations.point)]) and rolls_alike(problem.world_from_cam)
-    bad = effect > (NOT_DETERMINED_FLAT if flat and {"cx", "cy"} & set(problem.refine) else NOT_DETERMINED) * noise
+    bad = effect > NOT_DETERMINED * _field_radius(problem)
+    if _is_flat(problem.points[np.unique(problem.observations.point)]) and rolls_alike(problem.world_from_cam):
+        moved = np.isin(problem.refine * len(problem.intrinsics), ("cx", "cy"))
+        if moved.any():
+            limit = NOT_DETERMINED_FLAT * _noise_px(problem) / np.sqrt(len(problem.observations))
+            if (effect[moved] > limit).any():
+                bad |= effect > limit
     if not bad.any():
         return ()
     found = [
@@ -151,19 +197,20 @@ def calibration_complaints(
 
 
 def quality_warnings(
-    problem: BundleProblem, adjustment: Adjustment, dropped: tuple[int, ...], weakness: Floats
+    problem: BundleProblem, adjustment: Adjustment, dropped: tuple[int, ...], weakness: Floats, lost: Bools
 ) -> tuple[str, ...]:
     """Return what the reader of an adjustment must know besides its numbers.
 
     Args:
         dropped: points without an estimate after the outlier test.  weakness: (m,) of ``depth_weakness``.
+        lost: (m,) of ``undetermined_points``.
     """
     warnings = []
     names = problem.point_names
     if dropped:
-        lost = [names[j] for j in dropped]
+        gone = [names[j] for j in dropped]
         warnings.append(
-            f"{len(lost)} point(s) lost their rays to the outlier test and have no estimate: {listed(lost)}"
+            f"{len(gone)} point(s) lost their rays to the outlier test and have no estimate: {listed(gone)}"
         )
     rays = adjustment.rays
     few = (rays > 0) & (rays < 3) & ~problem.known()
@@ -178,7 +225,10 @@ def quality_warnings(
         warnings.append(
             f"{int(unseen.sum())} point(s) are in no image and have no estimate: {listed(named(names, unseen))}"
         )
-    weak = weakness > WEAK_DEPTH
+    if lost.any():
+        text = f"{int(lost.sum())} point(s) have (nearly) parallel rays; their distance is noise and has no sigma"
+        warnings.append(f"{text}: {listed(named(names, lost))}")
+    weak = (weakness > WEAK_DEPTH) & ~lost
     if weak.any():
         text = f"{int(weak.sum())} point(s) are seen under so small an angle that their distance is known to 1 % only"
         warnings.append(f"{text}: {listed(named(names, weak))}")
@@ -188,6 +238,7 @@ def quality_warnings(
         warnings.append(f"{share}: a gross error in them would hardly show")
     warnings.extend(tie_flags(problem.visible(), problem.image_names) if not problem.known().any() else ())
     warnings.extend(_variance_warning(adjustment))
+    warnings.extend(_weak_parameters(problem, adjustment))
     warnings.extend(_correlations(problem, adjustment))
     return tuple(warnings)
 
@@ -202,6 +253,17 @@ def _variance_warning(adjustment: Adjustment) -> tuple[str, ...]:
         f"sigma0 {adjustment.sigma0:.3f} lies outside [{low:.3f}, {high:.3f}] (99.9 %): the a-priori sigma of the "
         "image points is not theirs, or something is not modelled",
     )
+
+
+def _weak_parameters(problem: BundleProblem, adjustment: Adjustment) -> tuple[str, ...]:
+    if not adjustment.parameter_names:
+        return ()
+    sigma = np.sqrt(np.maximum(np.diag(adjustment.parameter_covariance), 0.0))
+    weak = parameter_effect(problem, sigma) > WEAK_PARAMETER * _noise_px(problem)
+    if not weak.any():
+        return ()
+    text = f"interior parameters that this network determines weakly: {listed(named(adjustment.parameter_names, weak))}"
+    return (text + _advice(problem),)
 
 
 def _correlations(problem: BundleProblem, adjustment: Adjustment) -> tuple[str, ...]:

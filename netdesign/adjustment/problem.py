@@ -8,7 +8,6 @@ import numpy as np
 from netdesign.errors import InfeasibleError, InputError
 from netdesign.model.adjustment import ControlPoints, Datum, PosePriors, ScaleBars
 from netdesign.model.arrays import Bools, Floats, Ints
-from netdesign.model.frames import similarity
 from netdesign.model.network import Observations
 from netdesign.photogrammetry.collinearity import project
 from netdesign.photogrammetry.connectivity import listed, named, structure_complaints
@@ -25,9 +24,9 @@ class BundleProblem:
         world_from_cam: (n, 4, 4), points: (m, 3): approximate values; the free datum is anchored on these points.
         refine: interior parameters to estimate, the same ones for every camera.
         datum: "free" inner constraints (7; control, bars and priors unused); "scale" inner constraints (6) and scale
-            bars; "control" control points with their weights; "fixed" all control points error-free.
+            bars; "control" control points with their weights; "fixed" all control points error-free; "poses" pose
+            priors with their weights. Scale bars join every datum but "free", pose priors join control points.
         datum_points: (m,) points that carry the inner constraints, None for all.
-        priors: pose priors, used in every datum but "free".
     """
 
     observations: Observations
@@ -59,7 +58,7 @@ class BundleProblem:
     @property
     def active_priors(self) -> PosePriors | None:
         """Pose priors as far as the datum uses them."""
-        return None if self.datum == "free" else self.priors
+        return self.priors if self.datum in ("poses", "control", "fixed") else None
 
     def visible(self) -> Bools:
         """Return (n, m): which image observes which point."""
@@ -97,13 +96,18 @@ class BundleProblem:
             eliminated=observed & ~fixed & ~kept,
         )
 
-    def normalised(self) -> tuple["BundleProblem", float, Floats]:
-        """Return the same problem in units of the points' extent about their centroid, the unit and the centroid.
+    def middle(self) -> Floats:
+        """Return (3,) the median of the observed points: a few absurd approximate values do not move it."""
+        return np.asarray(np.median(self.points[self.rays() > 0], axis=0))
 
-        Then no threshold and no rounding depends on the unit of length.
+    def normalised(self) -> tuple["BundleProblem", float, Floats]:
+        """Return the same problem in units of the points' extent about their middle, the unit and the middle.
+
+        Then no threshold and no rounding depends on the unit of length or on the origin: national coordinates of
+        5 000 km cost nothing.
         """
-        centre = self.points.mean(axis=0)
-        unit = float(np.sqrt(((self.points - centre) ** 2).sum(axis=1).mean()))
+        centre = self.middle()
+        unit = float(np.median(np.linalg.norm(self.points[self.rays() > 0] - centre, axis=1)))
         if not (np.isfinite(unit) and unit > 0):
             raise InfeasibleError("object points: all at one place, nothing to adjust")
         poses = _rescaled(self.world_from_cam, centre, unit)
@@ -116,7 +120,7 @@ class BundleProblem:
             priors = replace(
                 priors,
                 world_from_cam=_rescaled(priors.world_from_cam, centre, unit),
-                sigma_position=priors.sigma_position / unit,
+                sigma_position=np.asarray(priors.sigma_position) / unit,
             )
         points = (self.points - centre) / unit
         return (
@@ -124,26 +128,6 @@ class BundleProblem:
             unit,
             centre,
         )
-
-    def in_control_frame(self) -> "BundleProblem":
-        """Return the approximations carried by a similarity to the control points; fixed points at their coordinates.
-
-        An arbitrary COLMAP frame is as good a start as any. With fewer than three control points it stays as it is.
-        """
-        control = self.active_control
-        if control is None:
-            return self
-        poses, points = self.world_from_cam, self.points
-        source = points[control.point]
-        if len(source) >= 3 and np.linalg.svd(source - source.mean(axis=0), compute_uv=False)[1] > 1e-6:
-            scale, rotation, translation = similarity(source, control.xyz)
-            points = scale * points @ rotation.T + translation
-            poses = poses.copy()
-            poses[:, :3, 3] = scale * poses[:, :3, 3] @ rotation.T + translation
-            poses[:, :3, :3] = rotation @ poses[:, :3, :3]
-        points = points.copy()
-        points[control.point] = control.xyz
-        return replace(self, world_from_cam=poses, points=points)
 
 
 def _rescaled(poses: Floats, centre: Floats, unit: float) -> Floats:
@@ -154,13 +138,13 @@ def _rescaled(poses: Floats, centre: Floats, unit: float) -> Floats:
 
 def null_space(problem: BundleProblem, layout: Layout) -> tuple[Floats, Floats]:
     """Return (G_c (W, d), G_p (3m, d)): the datum parameters that nothing measured or fixed determines."""
-    centre = problem.points.mean(axis=0)
+    centre = problem.middle()
     g_points = point_null_space(problem.points, centre)
     rows = g_points.reshape(-1, 3, 7)
     g_camera = np.zeros((layout.width, 7))
     g_camera[: 6 * layout.images] = pose_null_space(problem.world_from_cam, centre)
     g_camera[int(layout.parameter_start[-1]) :] = rows[layout.kept].reshape(-1, 7)
-    known = [np.zeros((0, 7))]
+    known: list[Floats] = []
     if problem.active_control is not None:
         known.append(rows[problem.active_control.point].reshape(-1, 7))
     bars = problem.active_bars
@@ -169,8 +153,12 @@ def null_space(problem: BundleProblem, layout: Layout) -> tuple[Floats, Floats]:
         direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
         known.append(np.einsum("bi,big->bg", direction, rows[bars.a] - rows[bars.b]))
     if problem.active_priors is not None:
-        known.append(g_camera[: 6 * layout.images])
-    _, singular, right = np.linalg.svd(np.vstack(known))
+        image, position, rotation = problem.active_priors.weights
+        per_image = g_camera[: 6 * layout.images].reshape(-1, 6, 7)
+        known.append(per_image[image[rotation > 0], :3].reshape(-1, 7))
+        known.append(per_image[image[position > 0], 3:].reshape(-1, 7))
+    known.append(np.zeros((7, 7)))  # so that the decomposition always has seven right vectors
+    _, singular, right = np.linalg.svd(np.vstack(known), full_matrices=False)
     rank = int((singular > 1e-9 * max(1.0, singular.max(initial=0.0))).sum())
     open_ = right[rank:].T
     fixed = ~(layout.eliminated | layout.kept)
@@ -208,6 +196,8 @@ def check_input(problem: BundleProblem) -> None:
         raise InputError(f"datum {problem.datum}: expected control points, found none")
     if problem.datum == "scale" and (problem.bars is None or len(problem.bars.a) == 0):
         raise InputError("datum scale: expected scale bars, found none")
+    if problem.datum == "poses" and (problem.priors is None or len(problem.priors.world_from_cam) == 0):
+        raise InputError("datum poses: expected pose priors, found none")
     observed = problem.rays() > 0
     for what, index in (
         ("control point", None if problem.active_control is None else problem.active_control.point),

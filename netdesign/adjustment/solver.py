@@ -80,16 +80,17 @@ def _extra_equations(problem: BundleProblem, layout: Layout, linearised: Lineari
                     row[start : start + 3] = sign * difference / distance
             row[-1] = length - distance
             if sigma == 0:
-                rows.append(row)
+                if row[:-1].any():  # between two fixed points there is nothing to adjust
+                    rows.append(row)
             else:
                 camera_prior += np.outer(row[:-1], row[:-1]) / sigma**2
                 camera_rhs += row[:-1] * row[-1] / sigma**2
     if priors is not None:
-        for i in range(layout.images):
-            residual, jacobian = _pose_prior(problem, i)
+        residual, jacobian = _pose_priors(problem)
+        for i, r, j in zip(priors.weights[0].tolist(), residual, jacobian, strict=True):
             here = slice(6 * i, 6 * i + 6)
-            camera_prior[here, here] += jacobian.T @ jacobian
-            camera_rhs[here] += jacobian.T @ residual
+            camera_prior[here, here] += j.T @ j
+            camera_rhs[here] += j.T @ r
     extended = replace(
         linearised,
         point_prior=point_prior,
@@ -100,19 +101,26 @@ def _extra_equations(problem: BundleProblem, layout: Layout, linearised: Lineari
     return extended, np.array(rows).reshape(-1, layout.width + 1)
 
 
-def _pose_prior(problem: BundleProblem, image: int) -> tuple[Floats, Floats]:
-    """Return the whitened residual (6,) prior - estimate and its derivative (6, 6) of the estimate."""
+def _pose_priors(problem: BundleProblem) -> tuple[Floats, Floats]:
+    """Return the whitened residuals (p, 6) prior - estimate and the derivatives (p, 6, 6) of the estimates.
+
+    The rotation vector of a deviation is taken as the axial part of its matrix, sin instead of the angle: exact to
+    second order in the deviation, which is all that a prior needs.
+    """
     priors = problem.active_priors
     assert priors is not None
-    rotation = problem.world_from_cam[image, :3, :3]
-    # Small-angle logarithm: exact to first order in the deviation, which is all a prior of a robot needs.
-    turn = priors.world_from_cam[image, :3, :3].T @ rotation
-    omega = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    jacobian = np.zeros((6, 6))
-    jacobian[:3, :3] = 0.5 * (np.trace(turn) * np.eye(3) - turn.T) / priors.sigma_rotation
-    jacobian[3:, 3:] = rotation / priors.sigma_position
-    offset = priors.world_from_cam[image, :3, 3] - problem.world_from_cam[image, :3, 3]
-    return np.r_[-omega / priors.sigma_rotation, offset / priors.sigma_position], jacobian
+    image, position, rotation = priors.weights
+    estimate = problem.world_from_cam[image]
+    turn = np.swapaxes(priors.world_from_cam[:, :3, :3], 1, 2) @ estimate[:, :3, :3]
+    omega = 0.5 * np.stack(
+        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1
+    )
+    jacobian = np.zeros((len(image), 6, 6))
+    trace = np.trace(turn, axis1=1, axis2=2)[:, None, None]
+    jacobian[:, :3, :3] = 0.5 * (trace * np.eye(3) - np.swapaxes(turn, 1, 2)) * rotation[:, None, None]
+    jacobian[:, 3:, 3:] = estimate[:, :3, :3] * position[:, None, None]
+    offset = priors.world_from_cam[:, :3, 3] - estimate[:, :3, 3]
+    return np.concatenate([-omega * rotation[:, None], offset * position[:, None]], axis=1), jacobian
 
 
 def cost_parts(problem: BundleProblem, whiten: Floats) -> tuple[Floats, float, Floats]:
@@ -135,8 +143,7 @@ def cost_parts(problem: BundleProblem, whiten: Floats) -> tuple[Floats, float, F
         weighted = bars.sigma > 0
         extra += float((((bars.length - distance)[weighted] / bars.sigma[weighted]) ** 2).sum())
     if problem.active_priors is not None:
-        for i in range(len(problem.world_from_cam)):
-            extra += float((_pose_prior(problem, i)[0] ** 2).sum())
+        extra += float((_pose_priors(problem)[0] ** 2).sum())
     return np.asarray((residual**2).sum(axis=1)), extra, depth
 
 

@@ -166,9 +166,7 @@ def _image_points(images: Sequence[ImageLine], point_ids: Ints) -> tuple[Ints, I
 
 def _camera(line: CameraLine) -> Camera:
     """Return our camera of a COLMAP one."""
-    fx, fy, cx, cy, *distortion = (
-        0.0 if index is None else line.parameters[index] for index in PARAMETERS[line.model]
-    )
+    fx, fy, cx, cy, *distortion = (0.0 if index is None else line.parameters[index] for index in PARAMETERS[line.model])
     return Camera(
         width_px=line.size[0],
         height_px=line.size[1],

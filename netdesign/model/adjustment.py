@@ -8,7 +8,7 @@ import numpy as np
 from netdesign.model.arrays import Bools, Floats, Ints, frozen
 from netdesign.model.network import Observations
 
-Datum = Literal["free", "fixed", "control", "scale"]
+Datum = Literal["free", "fixed", "control", "scale", "poses"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,18 +51,32 @@ class ScaleBars:
 
 @dataclass(frozen=True, kw_only=True)
 class PosePriors:
-    """Poses known beforehand, from a robot say; independent from image to image.
+    """Poses known beforehand, from a robot or a satellite receiver say; independent from image to image.
 
     Attributes:
-        world_from_cam: (n, 4, 4) m.  sigma_position: m per axis.  sigma_rotation: rad per axis.
+        world_from_cam: (p, 4, 4) m.  image: (p,) image indices; default: all images in their order.
+        sigma_position: (p,) m per axis.  sigma_rotation: (p,) rad per axis. One number stands for all; inf: unknown.
     """
 
     world_from_cam: Floats
-    sigma_position: float
-    sigma_rotation: float
+    sigma_position: float | Floats
+    sigma_rotation: float | Floats
+    image: Ints | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "world_from_cam", frozen("world_from_cam", self.world_from_cam, ("n", 4, 4)))
+        object.__setattr__(self, "world_from_cam", frozen("world_from_cam", self.world_from_cam, ("p", 4, 4)))
+        count = len(self.world_from_cam)
+        image = np.arange(count) if self.image is None else self.image
+        object.__setattr__(self, "image", frozen("image", image, (count,), np.int64))
+        for name in ("sigma_position", "sigma_rotation"):
+            sigma = np.broadcast_to(np.asarray(getattr(self, name), dtype=np.float64), (count,))
+            object.__setattr__(self, name, frozen(name, sigma, (count,)))
+
+    @property
+    def weights(self) -> tuple[Ints, Floats, Floats]:
+        """Image indices (p,), 1/sigma of positions (p,) in 1/m and of rotations (p,) in 1/rad; 0 where unknown."""
+        assert self.image is not None
+        return self.image, 1.0 / np.asarray(self.sigma_position), 1.0 / np.asarray(self.sigma_rotation)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +99,7 @@ class Adjustment:
         redundancy_numbers: (k, 2) per image coordinate; with those of ``extra_redundancy`` they sum to ``redundancy``.
         extra_redundancy: of control coordinates, scale bars and pose priors together.
         point_covariance: (m, 3, 3) m²; inf for a point without an estimate, 0 for a fixed one.
+        inner_covariance: (m, 3, 3) m², carried to inner constraints over all adjusted points by S-transformation.
         joint_covariance: (3m, 3m) m², or None when not asked for.
         pose_covariance: (n, 6, 6), tangent omega (rad), v (m) in the camera frame.
         parameter_names: free interior parameters, camera by camera; parameter_covariance: (p, p).
@@ -104,6 +119,7 @@ class Adjustment:
     redundancy_numbers: Floats
     extra_redundancy: float
     point_covariance: Floats
+    inner_covariance: Floats
     joint_covariance: Floats | None
     pose_covariance: Floats
     parameter_names: tuple[str, ...]

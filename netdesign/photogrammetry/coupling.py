@@ -59,9 +59,10 @@ class Coupling:
         Args:
             covariance: C (W, W), symmetric.  other: O (d, W).
         """
-        return _spread(
+        blocks, products = _spread(
             self.start, self.column, self.value, np.ascontiguousarray(covariance), np.ascontiguousarray(other.T)
         )
+        return blocks, products
 
     def with_kept(self, kept_start: Ints) -> "Coupling":
         """Return B extended by the points that stand on the camera side: p = -B c, so their rows are -I.

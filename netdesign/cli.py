@@ -1,17 +1,18 @@
 """The command line: parses, calls a verb, prints its result; heavy imports wait until a verb is called."""
 
-import json
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import typer
 
+from netdesign.console import as_json as _json
+from netdesign.console import progress as _progress
+from netdesign.console import show as _print
+from netdesign.console import words as _words
+from netdesign.console import workers as _workers
 from netdesign.errors import InputError, NetdesignError
-
-if TYPE_CHECKING:
-    from netdesign.terminal import TerminalProgress
 
 # Typer brings its own click along, or takes the installed one: the class is found from what it exports.
 CommandProblem = cast(type[Exception], typer.BadParameter.__mro__[2])
@@ -120,6 +121,26 @@ def choose(
 
     choice = choose_network(run, knee=knee, max_sigma_um=max_sigma_um, max_images=max_images, max_tour=max_tour)
     _print(_json(choice.record) if as_json else choice.text)
+
+
+@app.command()
+def repair(
+    study: StudyFile,
+    stations: Annotated[
+        str | None, typer.Option(help="design.json#ID, CSV or images.txt; default: the study's existing")
+    ] = None,
+    add: Annotated[int, typer.Option(help="images to add, one after the other", min=0, max=60)] = 1,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="CSV to write: the stations, added ones last")
+    ] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Say what each image of a given network is worth and which to add next."""
+    from netdesign.repair import repair_study
+
+    with _progress() as progress:
+        found = repair_study(study, stations, add, output, progress)
+    _print(_json(found.record) if as_json else found.text)
 
 
 @app.command()
@@ -272,28 +293,3 @@ def main() -> None:
 def _complain(line: str, status: int) -> None:
     sys.stderr.write(line.rstrip() + "\n")
     sys.exit(status)
-
-
-def _print(text: str) -> None:
-    sys.stdout.write(text.rstrip("\n") + "\n")
-    sys.stdout.flush()
-
-
-def _json(value: Any) -> str:
-    from netdesign.files.store import plain
-
-    return json.dumps(plain(value), sort_keys=True, indent=1, ensure_ascii=False)
-
-
-def _words(text: str | None) -> tuple[str, ...]:
-    return tuple(word.strip() for word in (text or "").split(",") if word.strip())
-
-
-def _workers(count: int) -> int:
-    return count or len(os.sched_getaffinity(0))
-
-
-def _progress() -> "TerminalProgress":
-    from netdesign.terminal import TerminalProgress
-
-    return TerminalProgress()

@@ -16,6 +16,7 @@ from netdesign.files.noise import read_corner_noise
 from netdesign.files.packages import resolve_path
 from netdesign.files.parts import load_part, load_targets, spread_targets
 from netdesign.files.robot import bundle_robot, resolve_cell
+from netdesign.files.stations import parse_stations, stations_table
 from netdesign.files.store import write_bytes, write_text
 from netdesign.files.study_text import parse_study, read_toml, study_toml
 from netdesign.model.arrays import Floats, Ints
@@ -91,6 +92,10 @@ def resolve(path: Path, seed: int | None = None) -> ResolvedStudy:
     camera = study.camera
     if camera.noise_file is not None:
         camera = camera.model_copy(update={"noise_file": take(camera.noise_file, "inputs/noise.json")})
+    viewpoints = study.viewpoints
+    if viewpoints.existing is not None:
+        inputs["inputs/existing.csv"] = stations_table(viewpoints.existing, path.parent)
+        viewpoints = viewpoints.model_copy(update={"existing": "inputs/existing.csv"})
     robot = study.robot
     if robot is not None:
         robot, files = bundle_robot(robot, path.parent)
@@ -100,6 +105,7 @@ def resolve(path: Path, seed: int | None = None) -> ResolvedStudy:
             "part": part,
             "targets": targets,
             "camera": camera,
+            "viewpoints": viewpoints,
             "robot": robot,
             "seed": study.seed if seed is None else seed,
             "objectives": study.objectives.model_copy(update={"motion": study.motion}),
@@ -143,12 +149,20 @@ def load_task(path: Path, seed: int | None = None) -> Task:
         limits=limits,
         cell=None if study.robot is None else resolve_cell(study.robot, path.parent),
         sha256=resolved.sha256,
+        existing=_existing(resolved),
     )
 
 
 def _beside(path: Path, name: Any) -> Path:
     """Return the file that the study at ``path`` names: beside it, absolute, or inside an installed package."""
     return resolve_path(str(name), path.parent)
+
+
+def _existing(resolved: ResolvedStudy) -> Floats:
+    content = resolved.inputs.get("inputs/existing.csv")
+    if content is None:
+        return np.zeros((0, 4, 4))
+    return parse_stations(content, Path("existing.csv"))
 
 
 def _targets(study: Study, path: Path, part: Part, world_from_mesh: Floats) -> Targets:

@@ -40,6 +40,11 @@ def quaternion_xyzw(rotation: Floats) -> Floats:
     return np.asarray(Rotation.from_matrix(rotation).as_quat(canonical=True))
 
 
+def rotation_from_quaternion(quaternion: Floats) -> Floats:
+    """Return the rotations (…, 3, 3) of quaternions (…, 4), x y z w, of any length but zero."""
+    return np.asarray(Rotation.from_quat(quaternion).as_matrix())
+
+
 def skew(vectors: Floats) -> Floats:
     """Return the cross-product matrices (…, 3, 3) of vectors (…, 3): skew(a) @ b = a x b."""
     matrix = np.zeros((*vectors.shape, 3))

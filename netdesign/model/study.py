@@ -77,6 +77,9 @@ class ViewpointsTable(Table):
     azimuth_deg: Range = (-180, 180)
     roll_deg: Number | Literal["free"] = Field(0, description="about the optical axis; free: the robot chooses")
     max_images: Annotated[int, Field(ge=2, le=60)] = 16
+    existing: str | None = Field(
+        None, description="stations that every network contains: design.json#ID, CSV of export, COLMAP images.txt"
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> "ViewpointsTable":

@@ -125,4 +125,9 @@ class Task:
     limits: VisibilityLimits
     cell: RobotCell | None
     sha256: str
+    existing: Floats = field(default_factory=lambda: np.zeros((0, 4, 4)))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "existing", frozen("existing", self.existing, ("e", 4, 4)))
+
     left_out: tuple[int, ...] = ()

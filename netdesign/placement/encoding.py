@@ -12,6 +12,7 @@ import numpy as np
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.frames import sphere_directions, viewpoints_of
 from netdesign.model.task import ViewingSphere
+from netdesign.placement.set_cover import lattice
 from netdesign.search.operators import flip_bits, polynomial_mutation, sbx, uniform_crossover
 from netdesign.search.population import Population
 
@@ -42,6 +43,15 @@ class Chromosomes:
         alpha = rng.uniform(lower[0], upper[0], shape)
         beta = np.arcsin(rng.uniform(np.sin(lower[1]), np.sin(upper[1]), shape))
         return np.stack([alpha, beta], axis=-1)
+
+    def spread(self, count: int) -> Floats:
+        """Return about ``count`` viewpoints (c, 2), evenly spread over the admissible area (Fibonacci lattice)."""
+        lower, upper = self.bounds
+        share = (upper[0] - lower[0]) * (np.sin(upper[1]) - np.sin(lower[1])) / (4 * np.pi)
+        viewpoints = lattice(int(np.ceil(count / share)))
+        viewpoints[:, 0] = lower[0] + np.remainder(viewpoints[:, 0] - lower[0], 2 * np.pi)
+        inside = (viewpoints[:, 0] <= upper[0]) & (viewpoints[:, 1] >= lower[1]) & (viewpoints[:, 1] <= upper[1])
+        return np.asarray(viewpoints[inside])
 
     def folded(self, viewpoints: Floats) -> Floats:
         """Return viewpoints (…, 2) brought into the bounds: the azimuth wraps, what is still outside is clipped."""

@@ -16,7 +16,7 @@ from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.placement.coverage import coverage
 from netdesign.placement.encoding import Chromosomes
 from netdesign.placement.evaluation import MAX_SIGMA, MEAN_VARIANCE, JointTables, SphereTables, joint_tours
-from netdesign.placement.set_cover import CANDIDATES, Cover, lattice, smallest_cover
+from netdesign.placement.set_cover import CANDIDATES, Cover, smallest_cover
 from netdesign.placement.visibility_map import VisibilityMap
 
 NOISE_STEP = np.radians(2.0)  # cells of the table of sigmas: they change slowly with the viewpoint
@@ -87,12 +87,7 @@ def candidates(
     task: Task, visibility: VisibilityMap, joint_map: JointMap | None, tables: SphereTables
 ) -> tuple[Floats, Ints]:
     """Lattice viewpoints inside the range that the robot reaches and that see enough tags, and their cells."""
-    (low_a, high_a), (low_b, high_b) = task.sphere.azimuth, task.sphere.elevation
-    share = (high_a - low_a) * (np.sin(high_b) - np.sin(low_b)) / (4 * np.pi)
-    viewpoints = lattice(int(np.ceil(CANDIDATES / share)))
-    viewpoints[:, 0] = low_a + np.remainder(viewpoints[:, 0] - low_a, 2 * np.pi)
-    inside = (viewpoints[:, 0] <= high_a) & (viewpoints[:, 1] >= low_b) & (viewpoints[:, 1] <= high_b)
-    viewpoints = viewpoints[inside]
+    viewpoints = Chromosomes(sphere=task.sphere, slots=1).spread(CANDIDATES)
     if joint_map is not None:
         viewpoints = viewpoints[joint_map.reachable(viewpoints)]
     cells = visibility.cell_of(viewpoints)

@@ -8,6 +8,7 @@ from functools import cached_property
 import numba
 import numpy as np
 
+from netdesign.errors import InputError
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.progress import Progress, silent
 from netdesign.model.scene import CORNERS_PER_TAG
@@ -75,6 +76,8 @@ class Problem:
             InfeasibleError: some tag can be seen from nowhere, or no station the robot reaches sees enough.
         """
         named_ends(task)
+        if len(task.existing):
+            raise InputError("viewpoints.existing: only `netdesign repair` takes existing stations, not yet a search")
         progress("visibility map", 0, 3)
         visibility = VisibilityMap.build(task.scene, task.camera, task.sphere, task.limits)
         progress("joint map", 1, 3)

@@ -1,0 +1,132 @@
+"""Stations that exist already: read from a design, a program, a table of stations or a COLMAP images.txt.
+
+Whatever the source, it becomes the table that ``netdesign export --format csv`` writes before it is used: a run keeps
+that table, and running again from it gives the same bytes.
+"""
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+
+from netdesign.errors import InputError
+from netdesign.files.packages import resolve_path
+from netdesign.files.robot_program import stations_csv
+from netdesign.files.store import read_json
+from netdesign.model.arrays import Floats
+from netdesign.model.frames import inverse, pose, rotation_from_quaternion, viewpoints_of
+
+MM = 1e-3
+COLUMNS = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
+KINDS = "a design.json (with #ID), a program or table that export writes, or a COLMAP images.txt"
+
+
+def stations_table(reference: str, folder: Path) -> bytes:
+    """Return the table of the stations named by ``reference``: a file, with "#ID" for one network of a design.
+
+    Args:
+        folder: what a relative path is relative to.
+
+    Raises:
+        InputError: no such file, not one of the formats, or no such network; the message says which there are.
+    """
+    name, _, network = reference.partition("#")
+    path = resolve_path(name, folder)
+    if path.is_dir() and (path / "design.json").is_file():
+        path = path / "design.json"
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    if path.suffix == ".json":
+        poses = _of_json(path, network)
+    elif path.suffix == ".txt":
+        poses = _of_colmap(path)
+    elif path.suffix == ".csv":
+        content = path.read_bytes()
+        parse_stations(content, path)
+        return content
+    else:
+        raise InputError(f"{path}: expected {KINDS}, found a file that ends with {path.suffix!r}")
+    return stations_csv(viewpoints_of(-poses[:, :3, 2]), poses, None, ()).encode()
+
+
+def parse_stations(content: bytes, path: Path) -> Floats:
+    """Return world_from_cam (n, 4, 4) m of a table of stations; ``path`` is for messages.
+
+    Raises:
+        InputError: not a table, a column is missing, or a number cannot be read.
+    """
+    try:
+        rows = list(csv.DictReader(io.StringIO(content.decode("utf-8-sig"))))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: expected a table of stations (CSV), found {error}") from None
+    if not rows:
+        raise InputError(f"{path}: expected at least one station, found none")
+    missing = [column for column in COLUMNS if column not in rows[0]]
+    if missing:
+        raise InputError(f"{path}: expected the columns {', '.join(COLUMNS)}, found no {missing[0]}")
+    values = np.zeros((len(rows), len(COLUMNS)))
+    for number, row in enumerate(rows):
+        for place, column in enumerate(COLUMNS):
+            try:
+                values[number, place] = float(row[column])
+            except (TypeError, ValueError):
+                raise InputError(f"{path}:{number + 2}: {column}: expected a number, found {row[column]!r}") from None
+    return _poses(values[:, :3], values[:, 3:], path)
+
+
+def _poses(position_mm: Floats, quaternion: Floats, path: Path) -> Floats:
+    size = np.linalg.norm(quaternion, axis=1)
+    for row in np.flatnonzero(~np.isfinite(position_mm).all(axis=1) | ~(np.abs(size - 1.0) < 1e-3)):
+        raise InputError(
+            f"{path}: station {row}: expected finite numbers and a unit quaternion, found norm {size[row]:.4g}"
+        )
+    return pose(rotation_from_quaternion(quaternion), position_mm * MM)
+
+
+def _of_json(path: Path, network: str) -> Floats:
+    try:
+        kind = json.loads(path.read_text(encoding="utf-8")).get("format")
+    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError):
+        raise InputError(f"{path}: expected {KINDS}, found no JSON object") from None
+    if kind == "netdesign/program/1":
+        found = [item["world_from_cam_mm"] for item in read_json(path, "program")["stations"]]
+    else:
+        networks = {str(item["id"]): item for item in read_json(path, "design")["networks"]}
+        if not network and len(networks) == 1:
+            network = next(iter(networks))
+        if network not in networks:
+            said = f"found #{network}" if network else "found no #ID"
+            raise InputError(
+                f"{path}: expected the id of a network behind the name, #0 to #{len(networks) - 1}, {said}"
+            )
+        found = networks[network]["world_from_cam_mm"]
+    poses = np.array(found, dtype=np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        raise InputError(f"{path}: expected 4x4 matrices world_from_cam_mm, found an array of shape {poses.shape}")
+    poses[:, :3, 3] *= MM
+    return poses
+
+
+def _of_colmap(path: Path) -> Floats:
+    """Poses of images.txt: one line of ten words per image, then a line of image points that may be empty."""
+    lines = [line for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if line[:1] != "#"]
+    rows, number = [], 0
+    while number < len(lines):
+        words = lines[number].split()
+        if not words:
+            number += 1
+            continue
+        try:
+            rows.append([float(word) for word in words[1:8]])
+            int(words[0]), int(words[8]), words[9]
+        except (ValueError, IndexError):
+            raise InputError(
+                f"{path}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, found {lines[number].strip()[:60]!r}"
+            ) from None
+        number += 2
+    if not rows:
+        raise InputError(f"{path}: expected at least one image, found none")
+    values = np.array(rows)
+    return inverse(_poses(values[:, 4:], values[:, [1, 2, 3, 0]], path))

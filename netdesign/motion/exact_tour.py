@@ -6,21 +6,22 @@ Time n² K² 2ⁿ: meant for n K up to about 80. Source: M. Held, R. M. Karp, J.
 import numpy as np
 from numba import njit
 
-from netdesign.motion.joint_tour import legs_from
+from netdesign.motion.joint_tour import legs_along
 
 
 @njit(cache=True, error_model="numpy")
 def exact_joint_tour(options, count, label, barred, law, timed):  # type: ignore[no-untyped-def]
     """Return (closed tour (n + 1,) with the dummy in front, choice (n,), length), arguments as in ``joint_tour``."""
     n, _, most = options.shape
-    legs = np.empty((n, most, n, most))
-    sums, tops = np.empty(most), np.empty(most)
+    legs, pair, block = np.empty((n, most, n, most)), np.zeros(3, dtype=np.int64), np.empty((2, most, most))
     for i in range(n):
-        for k in range(count[i]):
-            for j in range(n):
-                legs_from(options, i, k, j, count[j], law, timed, sums, tops, legs[i, k, j])
-                if barred.size:
-                    for c in range(count[j]):
+        for j in range(n):
+            pair[1], pair[2] = i + 1, j + 1
+            legs_along(options, count, pair, law, timed, block)
+            for k in range(count[i]):
+                for c in range(count[j]):
+                    legs[i, k, j, c] = block[1, k, c]
+                    if barred.size:
                         legs[i, k, j, c] += barred[i, j, label[i, k], label[j, c]]
     full = (1 << n) - 1
     shortest = np.full((1 << n, n, most), np.inf)

@@ -20,18 +20,18 @@ from numba import njit
 from numpy.typing import NDArray
 
 from netdesign.model.arrays import Bools, Floats, Ints
-from netdesign.model.frames import look_at
+from netdesign.model.frames import look_at, sphere_directions
 from netdesign.model.scene import Part
 from netdesign.model.task import RobotCell, ViewingSphere
 from netdesign.motion.cell import ArmCell, load_arm
 from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION, REASONS, configuration_state
-from netdesign.motion.joint_lookup import MapArrays, options_at
+from netdesign.motion.joint_lookup import MapArrays, map_arrays, options_of
 from netdesign.motion.joint_sheets import sheets
 from netdesign.motion.kinematics import into_limits
 from netdesign.motion.stored import Arrays, content_key, stored
 from netdesign.motion.ur_kinematics import BRANCHES, ur_branches
 
-_VERSION = 2
+_VERSION = 3
 SEARCH_ROLLS = 12
 _GRID_CLOSED = {1: 128, SEARCH_ROLLS: 64}
 _GRID_SHEETS = {1: 64, SEARCH_ROLLS: 36}
@@ -87,17 +87,18 @@ class JointMap:
         kept = stored(key, lambda: _fill(arm, targets, follows))
         free = (kept["state"] == FREE).sum(axis=(0, 1, 2))
         labels = np.argsort(-free, kind="stable").astype(np.int64)
-        most = len(labels) if count == 1 else count
-        arrays = MapArrays(
-            kept["joints"], kept["state"], kept["usable"], half, labels, np.array(arm.placed.wraps), most
-        )
+        arrays = map_arrays(kept["joints"], kept["state"], kept["good"], np.array(arm.placed.wraps), half, labels)
         return cls(arm=arm, sphere=sphere, arrays=arrays, rolls=angles, follows=follows)
 
     def options(self, viewpoints: Floats) -> tuple[Floats, Ints]:
         """Return interpolated joints (n, r, K) rad and how many of the K are valid (n,), viewpoints (n, 2)."""
-        count = len(viewpoints)
-        joints = np.zeros((count, self.arrays.joints.shape[-1], self.arrays.most))
-        return joints, np.array([options_at(self.arrays, *viewpoints[i], joints[i]) for i in range(count)])
+        directions = sphere_directions(viewpoints)
+        joints = np.zeros((len(directions), self.arrays.joints.shape[-1], self.arrays.most))
+        count, block = np.zeros(len(directions), dtype=np.int64), np.empty_like(self.arrays.turns)
+        for i in range(len(directions)):
+            here = slice(i, i + 1)
+            options_of(self.arrays, directions[here], block, joints[here], count[here])
+        return joints, count
 
     @property
     def rest(self) -> float:
@@ -196,19 +197,18 @@ def _fill(arm: ArmCell, targets: Floats, follows: bool) -> Arrays:
     rest = _rest(arm) if follows else math.nan
     state = _states_of(arm.body, arm.placed.lower, arm.placed.upper, solved.reshape(-1, r), found.reshape(-1), rest)
     joints, state = solved.astype(np.float32), state.reshape(*shape, count)
-    return {"joints": joints, "state": state, "usable": _usable(joints, state, np.array(arm.placed.wraps))}
+    return {"joints": joints, "state": state, "good": _good(joints, state, np.array(arm.placed.wraps))}
 
 
-def _usable(joints: NDArray[np.float32], state: NDArray[np.int8], wraps: Bools) -> NDArray[np.uint16]:
-    """Return the cells (R, G - 1, G - 1) with a bit for every branch that can be interpolated in them."""
+def _good(joints: NDArray[np.float32], state: NDArray[np.int8], wraps: Bools) -> Bools:
+    """Return the cells (R, G - 1, G - 1, B) in which a branch can be interpolated."""
     corners = [(slice(i, i - 1 or None), slice(j, j - 1 or None)) for i, j in ((0, 0), (1, 0), (0, 1), (1, 1))]
-    good = np.logical_and.reduce([state[:, i, j] == FREE for i, j in corners])
+    good: Bools = np.logical_and.reduce([state[:, i, j] == FREE for i, j in corners])
     for i, j in corners[1:]:
         change = joints[:, i, j] - joints[:, :-1, :-1]
         change -= np.where(wraps, 2.0 * np.pi * np.rint(change / (2.0 * np.pi)), 0.0)
         good &= np.abs(change).max(axis=-1) <= _LARGEST_JUMP
-    bits = np.left_shift(1, np.arange(good.shape[-1]), dtype=np.int64)
-    return np.asarray((good * bits).sum(axis=-1), dtype=np.uint16)
+    return good
 
 
 def solve_closed(arm: ArmCell, targets: Floats) -> tuple[Floats, Bools]:

@@ -8,6 +8,7 @@ import numpy as np
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.motion.cell import ArmCell
 from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION, REASONS, states
+from netdesign.motion.joint_lookup import LANES
 from netdesign.motion.joint_map import JointMap, solve_closed
 from netdesign.motion.joint_sheets import free_joints
 from netdesign.motion.kinematics import into_limits, refine
@@ -21,7 +22,8 @@ class StationOptions:
     """Joint options of n stations, option by column as the kernels want them.
 
     Attributes:
-        joints: (n, r, K) rad, each inside the limits.  count: (n,).  label: (n, K) branch of each option.
+        joints: (n, r, K) rad, each inside the limits; K a multiple of LANES.
+        count: (n,).  label: (n, K) branch of each option.
         refused: station index and reason of the stations without any option.
     """
 
@@ -91,7 +93,7 @@ def lifted(options: StationOptions, chosen: list[list[int]], lower: Floats, uppe
 
 
 def _packed(kept: list[tuple[Floats, Ints]], r: int, refused: tuple[tuple[int, str], ...]) -> StationOptions:
-    most = max([len(joints) for joints, _ in kept] + [1])
+    most = -(-max([len(joints) for joints, _ in kept] + [1]) // LANES) * LANES
     packed, labels = np.zeros((len(kept), r, most)), np.zeros((len(kept), most), dtype=np.int64)
     for index, (joints, label) in enumerate(kept):
         packed[index, :, : len(joints)] = joints.T.reshape(r, len(joints))

@@ -9,18 +9,20 @@
    that does not help, via points are put in.
 """
 
+import itertools
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from netdesign.model.arrays import Floats, Ints
+from netdesign.model.frames import sphere_directions
 from netdesign.model.results import Tour
 from netdesign.model.scene import Part
 from netdesign.model.task import RobotCell, ViewingSphere
 from netdesign.motion.exact_tour import exact_joint_tour
 from netdesign.motion.joint_map import JointMap
-from netdesign.motion.joint_tour import NO_TURN, directions_tour, joint_tour, law_of, legs_from, scratch
+from netdesign.motion.joint_tour import NO_TURN, directions_tour, joint_tour, law_of, legs_along, work_for
 from netdesign.motion.kinematics import forward
 from netdesign.motion.legs import Legs
 from netdesign.motion.options import StationOptions, exact_options, lifted
@@ -68,8 +70,17 @@ class _Problem:
         """Return (length, closed tour, choice) of the alternation from a closed tour (n + 1,)."""
         tour = start.copy()
         o = self.options
-        length, choice = joint_tour(o.joints, o.count, o.label, self.barred, self.law, self.timed, tour, _ROUNDS)
-        return float(length), tour, choice
+        work = work_for(*o.joints.shape)
+        length = joint_tour(o.joints, o.count, o.label, self.barred, self.law, self.timed, tour, _ROUNDS, work)
+        return float(length), tour, work.choice
+
+    def legs(self, route: list[int]) -> list[Floats]:
+        """Return the costs (K_i, K_j) of all legs between the stations that follow each other, without bars."""
+        o, most = self.options, self.options.joints.shape[2]
+        tour, found = np.array([0, *route]), np.empty((len(route), most, most))
+        tour[1:] += 1
+        legs_along(o.joints, o.count, tour, self.law, self.timed, found)
+        return [found[p, : o.count[i], : o.count[j]] for p, (i, j) in enumerate(itertools.pairwise(route), start=1)]
 
     def exact(self) -> tuple[float, Ints, Ints]:
         """Return the same of the exact optimum."""
@@ -127,10 +138,10 @@ def tour_length(joints: Floats, vias: dict[int, Floats], law: Floats, timed: boo
         way += [vias[leg]] if leg in vias else []
         way.append(joints[leg + 1 : leg + 2])
     points = np.concatenate(way)
-    change = np.abs(np.diff(points, axis=0))
+    change, r = np.abs(np.diff(points, axis=0)), joints.shape[1]
     if not timed:
-        return float(np.sqrt(((law[0] * change) ** 2).sum(axis=1)).sum())
-    longest, hardest = (change * law[1]).max(axis=1), (change * law[2]).max(axis=1)
+        return float(np.sqrt(((law[0, :r] * change) ** 2).sum(axis=1)).sum())
+    longest, hardest = (change * law[1, :r]).max(axis=1), (change * law[2, :r]).max(axis=1)
     cruise = longest**2 >= hardest
     ramp = hardest / np.where(longest > 0, longest, 1.0)
     return float(np.where(cruise, longest + ramp, 2.0 * np.sqrt(hardest)).sum())
@@ -146,7 +157,7 @@ def _plain(law: Floats) -> Floats:
 def _starts(problem: _Problem, viewpoints: Floats, seed: int) -> list[tuple[float, Ints, Ints]]:
     """Return tours modulo whole turns, the best first; the exact optimum only where it can be had."""
     count, most = len(viewpoints), problem.options.joints.shape[2]
-    first = directions_tour(viewpoints)
+    first = directions_tour(sphere_directions(viewpoints))
     found = [problem.tour(first)]
     if count <= _EXACT_STATIONS and count * most <= _EXACT_STATES:
         found.append(problem.exact())
@@ -167,16 +178,11 @@ def _starts(problem: _Problem, viewpoints: Floats, seed: int) -> list[tuple[floa
 def _nearest_options(problem: _Problem) -> Floats:
     """Return the least cost (n, n) of a leg between two stations over all their options."""
     options = problem.options
-    count, _, most = options.joints.shape
-    _, leg, sums, tops, _ = scratch(count, most)
+    count = len(options.count)
     distance = np.zeros((count, count))
     for i in range(count):
         for j in range(i):
-            least = np.inf
-            for k in range(0, options.count[i], max(options.count[i] // 24, 1)):
-                legs_from(options.joints, i, k, j, options.count[j], problem.law, problem.timed, sums, tops, leg)
-                least = min(least, float(leg[: options.count[j]].min()))
-            distance[i, j] = distance[j, i] = least
+            distance[i, j] = distance[j, i] = problem.legs([i, j])[0].min()
     return distance
 
 
@@ -184,16 +190,12 @@ def _best_through(problem: _Problem, tour: Ints) -> list[list[int]]:
     """Return, per station, the options with the shortest tours through them for one order, the best first."""
     options = problem.options
     count, _, most = options.joints.shape
-    _, leg, sums, tops, _ = scratch(count, most)
     forward_cost, backward = np.full((count, most), np.inf), np.full((count, most), np.inf)
     stations = tour[1:] - 1
     for costs, route in ((forward_cost, stations), (backward, stations[::-1])):
         costs[route[0], : options.count[route[0]]] = 0.0
-        for i, j in zip(route[:-1].tolist(), route[1:].tolist(), strict=True):
-            reach = options.count[j]
-            for k in range(options.count[i]):
-                legs_from(options.joints, i, k, j, reach, problem.law, problem.timed, sums, tops, leg)
-                np.minimum(costs[j, :reach], costs[i, k] + leg[:reach], out=costs[j, :reach])
+        for i, j, legs in zip(route[:-1].tolist(), route[1:].tolist(), problem.legs(route.tolist()), strict=True):
+            costs[j, : options.count[j]] = (costs[i, : options.count[i], None] + legs).min(axis=0)
     total = forward_cost + backward
     return [np.argsort(total[i, : options.count[i]], kind="stable")[:_LIFTED_OPTIONS].tolist() for i in range(count)]
 
@@ -242,13 +244,13 @@ def _ordered(problem: _Problem, tour: Ints) -> tuple[Ints, Floats, Ints]:
 
 def _distances(joints: Floats, labels: Ints, problem: _Problem) -> Floats:
     """Return the cost (n, n) of the legs between joints (n, r), barred legs included."""
-    change = np.abs(joints[:, None] - joints)
+    change, r = np.abs(joints[:, None] - joints), joints.shape[1]
     if problem.timed:
-        longest, hardest = (change * problem.law[1]).max(axis=2), (change * problem.law[2]).max(axis=2)
+        longest, hardest = (change * problem.law[1, :r]).max(axis=2), (change * problem.law[2, :r]).max(axis=2)
         ramp = hardest / np.where(longest > 0, longest, 1.0)
         cost = np.where(longest**2 >= hardest, longest + ramp, 2.0 * np.sqrt(hardest))
     else:
-        cost = np.sqrt(((problem.law[0] * change) ** 2).sum(axis=2))
+        cost = np.sqrt(((problem.law[0, :r] * change) ** 2).sum(axis=2))
     stations = np.arange(len(joints))
     cost = cost + problem.barred[stations[:, None], stations, labels[:, None], labels]
     np.fill_diagonal(cost, 0.0)

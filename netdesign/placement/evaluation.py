@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.scene import CORNERS_PER_TAG
-from netdesign.motion.joint_tour import network_tour
+from netdesign.motion.joint_tour import network_tour, search_work_for
 from netdesign.motion.tour import path_length
 from netdesign.photogrammetry.limited_error import LANES, add_four_cameras, variances_from_moments
 from netdesign.placement.visibility_map import cell_index
@@ -175,6 +175,7 @@ def joint_tours(bits: Bools, genes: Floats, joint: JointTables, objectives: Floa
     """
     count, slots = bits.shape
     viewpoints = np.zeros((slots, 2))
+    own, work = search_work_for(joint.arrays, slots)
     for p in range(count):
         if violation[p] > 0:
             continue
@@ -183,7 +184,7 @@ def joint_tours(bits: Bools, genes: Floats, joint: JointTables, objectives: Floa
             if bits[p, slot]:
                 viewpoints[k, 0], viewpoints[k, 1] = genes[p, slot, 0], genes[p, slot, 1]
                 k += 1
-        length, refused = network_tour(joint.arrays, joint.law, joint.timed, joint.dwell, viewpoints[:k])
+        length, refused = network_tour(joint.arrays, joint.law, joint.timed, joint.dwell, viewpoints[:k], own, work)
         objectives[p, 1] = length
         violation[p] = refused + excess(length, joint.longest)
 

@@ -17,7 +17,7 @@ import numba
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the scene, and the package of this checkout
 
-from validation.benchmarks import engines, kernels, standard
+from validation.benchmarks import engines, kernels, motion, standard
 
 
 def cpu(work: Callable[[], object], repeats: int) -> list[float]:
@@ -42,10 +42,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--long", action="store_true")
-    parser.add_argument("--only", nargs="*", help="of: kernels tours engines standard")
+    parser.add_argument("--only", nargs="*", help="of: kernels tours motion engines standard")
     options = parser.parse_args()
     numba.set_num_threads(1)
-    chosen = options.only or ["kernels", "tours", "engines", "standard"]
+    chosen = options.only or ["kernels", "tours", "motion", "engines", "standard"]
     with tempfile.TemporaryDirectory() as folder:
         if "kernels" in chosen:
             sides = kernels.Sides(Path(folder))
@@ -61,6 +61,9 @@ def main() -> None:
             for n in (20, 30):
                 for line in kernels.tours(n, cpu, ratio, options.repeats):
                     print(line)
+        if "motion" in chosen:
+            for line in motion.lines(cpu, ratio, options.repeats):
+                print(line)
         if "engines" in chosen:
             for line in engines.lines(options.long):
                 print(line)

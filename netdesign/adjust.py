@@ -17,13 +17,18 @@ from netdesign.adjustment.problem import BundleProblem
 from netdesign.errors import InputError
 from netdesign.files.adjustment import adjustment_payload
 from netdesign.files.colmap import MODEL_FILES
-from netdesign.files.observations import ObservationSet, read_control, read_observation_set, read_scale_bars
+from netdesign.files.datum_tables import read_control, read_pose_priors, read_scale_bars
+from netdesign.files.observations import ObservationSet, read_observation_set
 from netdesign.files.store import plain, write_json
 from netdesign.model.adjustment import Adjustment, Datum
 from netdesign.model.arrays import Bools
 from netdesign.model.progress import Progress, silent
 from netdesign.photo_set import is_photo_set, read_photo_set
+from netdesign.photogrammetry.connectivity import listed
 from netdesign.photogrammetry.observation_equations import parameter_matrix
+from netdesign.reporting.adjustment import adjustment_text
+
+USUAL_ITERATIONS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +49,7 @@ def adjust_folder(
     datum_points: Sequence[str] | None = None,
     control: Path | None = None,
     scale_bars: Path | None = None,
+    poses: Path | None = None,
     refine: Sequence[str] | None = None,
     robust: bool = False,
     out: Path | None = None,
@@ -53,9 +59,9 @@ def adjust_folder(
 
     Args:
         sigma_px: image-coordinate noise, instead of what the set says.
-        datum: None takes control if the set has control points, else scale if it has scale bars, else free.
+        datum: None takes what the set holds first of control points, pose priors, scale bars; else free.
         datum_points: names of the points that carry the inner constraints, None or none for all.
-        control, scale_bars: files, instead of control.csv and scalebars.csv in the folder.
+        control, scale_bars, poses: files, instead of control.csv, scalebars.csv and poses.csv in the folder.
         refine: interior parameters to estimate.  robust: find and reject gross errors.
         out: folder for adjustment.json, None for ``folder``.
 
@@ -64,11 +70,15 @@ def adjust_folder(
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder with an observation set or an image set, found none")
-    progress("adjust", 0, 3, "read")
-    found, left_out = _read(folder, sigma_px, progress)
-    control_path, bars_path = control or folder / "control.csv", scale_bars or folder / "scalebars.csv"
-    has_control, has_bars = control is not None or control_path.is_file(), scale_bars is not None or bars_path.is_file()
-    chosen: Datum = datum or ("control" if has_control else "scale" if has_bars else "free")
+    place = out or folder
+    if place.exists() and not place.is_dir():
+        raise InputError(f"{place}: expected a folder to write adjustment.json into, found a file")
+    progress("read", 0, 1)
+    found, blind, notes = _read(folder, sigma_px, progress)
+    progress("read", 1, 1)
+    control_path = _table(control, folder / "control.csv")
+    bars_path = _table(scale_bars, folder / "scalebars.csv")
+    poses_path = _table(poses, folder / "poses.csv")
     names = tuple(refine or ())
     try:
         for row in found.intrinsics:
@@ -84,32 +94,63 @@ def adjust_folder(
         image_names=found.image_names,
         point_names=found.point_names,
         refine=names,
-        datum=chosen,
+        datum=datum or _usual_datum(control_path, poses_path, bars_path),
         datum_points=_mask(datum_points, found.point_names),
-        control=read_control(control_path, found.point_names) if has_control else None,
-        bars=read_scale_bars(bars_path, found.point_names) if has_bars else None,
+        control=None if control_path is None else read_control(control_path, found.point_names),
+        bars=None if bars_path is None else read_scale_bars(bars_path, found.point_names),
+        priors=(
+            None
+            if poses_path is None
+            else read_pose_priors(poses_path, found.image_names, found.world_from_cam, left_out=blind)
+        ),
     )
-    progress("adjust", 1, 3, "adjust")
-    adjustment = estimate(problem, robust=robust, sigma_known=found.sigma_known)
-    adjustment = replace(adjustment, warnings=(*left_out, *_notes(problem, found), *adjustment.warnings))
-    progress("adjust", 2, 3, "write")
-    record = adjustment_payload(adjustment, found.image_names, found.point_names)
-    path = (out or folder) / "adjustment.json"
-    write_json(path, "adjustment", record)
-    progress("adjust", 3, 3)
-    return AdjustOutcome(record=plain(record), text=_summary(adjustment, path), adjustment=adjustment, path=path)
+
+    def iterated(iteration: int, cost: float) -> None:
+        progress("adjust", iteration - 1, max(USUAL_ITERATIONS, iteration), f"sum of squares {cost:.6g}")
+
+    adjustment = estimate(problem, robust=robust, sigma_known=found.sigma_known, progress=iterated)
+    progress("adjust", USUAL_ITERATIONS, USUAL_ITERATIONS)
+    adjustment = replace(adjustment, warnings=(*notes, *_notes(problem, found), *adjustment.warnings))
+    record = plain(adjustment_payload(adjustment, found.image_names, found.point_names))
+    path = place / "adjustment.json"
+    try:
+        write_json(path, "adjustment", record)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); say where to with -o OUT") from None
+    text = f"{adjustment_text(adjustment)}\nwritten      {path}"
+    return AdjustOutcome(record=record, text=text, adjustment=adjustment, path=path)
 
 
-def _read(folder: Path, sigma_px: float | None, progress: Progress) -> tuple[ObservationSet, tuple[str, ...]]:
-    """Return what the folder holds, and what of it was left out."""
+def _read(
+    folder: Path, sigma_px: float | None, progress: Progress
+) -> tuple[ObservationSet, tuple[str, ...], tuple[str, ...]]:
+    """Return what the folder holds, the images that were left out, and what is to be said about it."""
     if is_photo_set(folder):
         photos = read_photo_set(folder, sigma_px, progress)
-        return photos.observations, photos.notes
+        return photos.observations, (), photos.notes
     if any((folder / name).is_file() for name in MODEL_FILES):
-        return read_observation_set(folder, sigma_px), ()
+        found, blind = read_observation_set(folder, sigma_px).without_blind_images()
+        return (
+            found,
+            blind,
+            (f"{len(blind)} image(s) without image points are left out: {listed(blind)}",) * bool(blind),
+        )
     raise InputError(
         f"{folder}: expected a COLMAP text model ({', '.join(MODEL_FILES)}) or camera.toml with photographs"
     )
+
+
+def _table(given: Path | None, usual: Path) -> Path | None:
+    """Return the file that was named, else the usual one if it is there."""
+    return given if given is not None else usual if usual.is_file() else None
+
+
+def _usual_datum(control: Path | None, poses: Path | None, bars: Path | None) -> Datum:
+    if control is not None:
+        return "control"
+    if poses is not None:
+        return "poses"
+    return "free" if bars is None else "scale"
 
 
 def _mask(names: Sequence[str] | None, point_names: Sequence[str]) -> Bools | None:
@@ -120,7 +161,8 @@ def _mask(names: Sequence[str] | None, point_names: Sequence[str]) -> Bools | No
     """
     if not names:
         return None
-    unknown = [name for name in names if name not in point_names]
+    known = set(point_names)
+    unknown = [name for name in names if name not in known]
     if unknown:
         raise InputError(f"datum-points: expected names of object points, found {unknown[0]!r}")
     return np.isin(np.array(point_names), np.array(names))
@@ -133,40 +175,12 @@ def _notes(problem: BundleProblem, found: ObservationSet) -> list[str]:
         notes.append(
             "nothing gives the noise of the image points: 1 px is assumed, a-posteriori sigmas are right anyway"
         )
-    if problem.control is not None and problem.datum not in ("control", "fixed"):
+    if problem.control is not None and problem.active_control is None:
         notes.append(f"control points are not used by datum {problem.datum}")
+    if problem.priors is not None and problem.active_priors is None:
+        notes.append(f"pose priors are not used by datum {problem.datum}")
     if problem.bars is not None and problem.datum == "free":
         notes.append("scale bars are not used by datum free: lengths refer to the scale of the approximate values")
-    if problem.datum_points is not None and problem.datum in ("control", "fixed"):
+    if problem.datum_points is not None and problem.datum not in ("free", "scale"):
         notes.append(f"datum points are not used by datum {problem.datum}")
     return notes
-
-
-def _summary(adjustment: Adjustment, path: Path) -> str:
-    """Return what a person wants to know first; every sigma with its datum."""
-    used = adjustment.used
-    factor = adjustment.sigma0 if np.isfinite(adjustment.sigma0) else 1.0
-    variance = np.trace(adjustment.point_covariance[used], axis1=1, axis2=2) / 3.0 * factor**2
-    rms_px = float(np.sqrt((adjustment.residuals_px**2).mean()))
-    lines = [
-        f"datum        {adjustment.datum}",
-        f"images       {len(adjustment.world_from_cam)}, points {int(used.sum())}, "
-        f"image points {len(adjustment.observations)}, rejected {len(adjustment.rejected)}",
-        f"observations {adjustment.n_observations}, unknowns {adjustment.n_unknowns}, datum constraints "
-        f"{adjustment.n_datum}, redundancy {adjustment.redundancy}",
-        f"sigma0       {adjustment.sigma0:.4f} (a priori 1), residuals {rms_px:.4f} px rms, "
-        f"{adjustment.iterations} iterations",
-        f"point sigma  {np.sqrt(variance.mean()) * 1e6:.4g} um rms, {np.sqrt(variance.max(initial=0.0)) * 1e6:.4g} um "
-        "worst (per coordinate, a posteriori)",
-        f"redundancy   {adjustment.redundancy_numbers.mean(axis=0)[0]:.3f} in x, "
-        f"{adjustment.redundancy_numbers.mean(axis=0)[1]:.3f} in y on average",
-    ]
-    sigma = np.sqrt(np.maximum(np.diag(adjustment.parameter_covariance), 0.0)) * factor
-    share = max(len(sigma) // len(adjustment.intrinsics), 1)
-    for index, (name, value) in enumerate(zip(adjustment.parameter_names, sigma.tolist(), strict=True)):
-        row = adjustment.intrinsics[index // share]
-        key = name.split()[-1]
-        position = 0 if key == "f" else ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2").index(key)
-        lines.append(f"{name:<12} {row[position]:.9g} +- {value:.3g}")
-    lines += [f"warning      {text}" for text in adjustment.warnings]
-    return "\n".join([*lines, f"written      {path}"])

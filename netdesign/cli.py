@@ -206,15 +206,16 @@ def adjust(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="image set or observation set", show_default=False)],
     sigma_px: Annotated[float | None, typer.Option(help="image-coordinate noise; default: the set's own")] = None,
     datum: Annotated[
-        Literal["free", "fixed", "control", "scale"] | None,
+        Literal["free", "fixed", "control", "scale", "poses"] | None,
         typer.Option(help="what fixes the frame; default: what the set brings, else free"),
     ] = None,
     datum_points: Annotated[str | None, typer.Option(help="a,b,c…: points of the inner constraints")] = None,
     control: Annotated[Path | None, typer.Option(help="CSV: point,x_mm,y_mm,z_mm,sigma_mm")] = None,
     scale_bars: Annotated[Path | None, typer.Option(help="CSV: a,b,length_mm,sigma_mm")] = None,
+    poses: Annotated[Path | None, typer.Option(help="CSV: image,sigma_position_mm,sigma_rotation_deg[,pose]")] = None,
     refine: Annotated[str | None, typer.Option(help="any of f,fx,fy,cx,cy,k1,k2,p1,p2")] = None,
     robust: Annotated[bool, typer.Option("--robust", help="find and reject gross errors")] = False,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="folder for adjustment.json")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="folder for the result; default: DIR")] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Bundle adjustment of an image set or an observation set, real or synthetic."""
@@ -228,6 +229,7 @@ def adjust(
             datum_points=_words(datum_points),
             control=control,
             scale_bars=scale_bars,
+            poses=poses,
             refine=_words(refine),
             robust=robust,
             out=output,
@@ -270,9 +272,7 @@ def doctor(as_json: JsonFlag = False) -> None:
 
 def main() -> None:
     """Run the command line and leave with the exit status of the contract."""
-    # Our matrices are small and our processes many: threads of the linear algebra would only wait for each other
-    # (the normal equations of 115 images: 5 ms with one thread, 1 s with two on a busy machine).
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads would only wait for each other
     try:
         app(standalone_mode=False)
     except CommandProblem as problem:

@@ -243,10 +243,11 @@ def write_project(folder, project, points2d=True, csv=False, covariances=True, l
         put("scalebars.csv", lines)
 
 
-def dense_sigmas(project, record, datum, refine=(), datum_points=None):
+def dense_sigmas(project, record, datum, refine=(), datum_points=None, priors=None):
     """Sigmas a priori of points (m, 3), projection centres (n, 3) in mm, and interior parameters, at the estimates.
 
-    One dense normal matrix of everything, bordered by the datum; lengths in units of the object's extent.
+    One dense normal matrix of everything, bordered by the datum; lengths in units of the object's extent. ``priors``:
+    sigma of all positions (m) and rotations (rad).
     """
     order = {name: i for i, name in enumerate(project.names)}
     rows = {row["name"]: row for row in record["images"]}
@@ -279,7 +280,13 @@ def dense_sigmas(project, record, datum, refine=(), datum_points=None):
     first = 6 * n + p
     extra = []
     fixed = np.zeros(m, bool)
-    if datum in ("control", "fixed"):
+    if priors is not None:
+        block = np.zeros((6 * n, design.shape[1]))
+        block[range(6 * n), range(6 * n)] = np.tile(
+            1 / np.r_[np.full(3, priors[1]), np.full(3, priors[0] * 1e3 / unit)], n
+        )
+        extra.append(block)
+    if datum in ("control", "fixed") and project.control is not None:
         for j, _, sigma in zip(*project.control, strict=True):
             if sigma == 0 or datum == "fixed":
                 fixed[j] = True

@@ -4,14 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from netdesign.adjust import adjust_folder
-from netdesign.errors import InfeasibleError
+from netdesign.errors import InfeasibleError, InputError
 from netdesign.model.frames import exp_rotation
+from netdesign.photogrammetry.datum import s_transformation
 from tests.projects import (
     MODELS,
     aerial,
     building,
+    dense_sigmas,
     disagreement,
     field_of_targets,
     observed,
@@ -247,3 +250,119 @@ def test_two_cameras_have_an_interior_orientation_each(tmp_path, refine):
     record = _adjusted(tmp_path, project, sigma_px=0.1, datum="free", refine=refine)
     # The record lists the cameras by ascending id: 4 before 9.
     assert max(disagreement(swapped, record, "free", refine)) < 1e-8
+
+
+def _poses_csv(path, project, position_mm, rotation_deg, which, seed=0, shift=0.0):
+    """Priors on the truth with errors of their sigma; an empty sigma where None is given."""
+    rng = np.random.default_rng(seed)
+    lines = ["image,sigma_position_mm,sigma_rotation_deg,x_mm,y_mm,z_mm,qx,qy,qz,qw"]
+    for i in which:
+        position = project.poses[i, :3, 3] * 1e3 + (position_mm or 0) * rng.standard_normal(3) + shift
+        turn = np.radians(rotation_deg or 0) * rng.standard_normal(3)
+        quaternion = Rotation.from_matrix(project.poses[i, :3, :3] @ exp_rotation(turn)).as_quat()
+        if rotation_deg is None:
+            quaternion = [""] * 4
+        values = [project.names[i], position_mm or "", rotation_deg or "", *position, *quaternion]
+        lines.append(",".join(str(value) for value in values))
+    path.write_text("# from the robot\n" + "\n".join(lines) + "\n")
+
+
+def test_pose_priors_of_a_robot_carry_the_datum(tmp_path):
+    project = replace(part(10, 50), bars=None)
+    write_project(tmp_path, poor_start(project, position=0.004, degrees=0.2, point=0.002))
+    _poses_csv(tmp_path / "poses.csv", project, 0.05, 0.01, range(10))
+    record = adjust_folder(tmp_path, sigma_px=0.1).record
+    assert record["datum"] == "poses: 10 pose priors"
+    assert (record["n_datum"], record["n_observations"]) == (0, 2 * len(project.image) + 60)
+    error = _points(project, record) - project.points
+    sigma = np.array([{row["id"]: row for row in record["points"]}[str(i)]["sigma_mm"] for i in project.ids]) / 1e3
+    assert np.abs(error / sigma).max() < 5
+    # The dense normal equations with the priors as rows.
+    _, _, _, covariance = dense_sigmas(project, record, "control", priors=(0.05e-3, np.radians(0.01)))
+    first = 6 * 10
+    points = np.array([{row["id"]: row for row in record["points"]}[str(i)]["xyz_mm"] for i in project.ids])
+    unit = np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean())
+    dense = np.sqrt(np.diag(covariance))[first:].reshape(-1, 3) * unit
+    apriori = np.array([{row["id"]: row for row in record["points"]}[str(i)]["sigma_apriori_mm"] for i in project.ids])
+    np.testing.assert_allclose(apriori, dense, rtol=1e-8)
+    # The inner precision is that of the free network: the priors say next to nothing about the shape.
+    free = adjust_folder(tmp_path, sigma_px=0.1, datum="free", out=tmp_path / "free").record
+    inner = np.array([row["sigma_inner_mm"] for row in record["points"]]) / record["sigma0"]
+    alone = np.array([row["sigma_apriori_mm"] for row in free["points"]])
+    assert (inner < 0.5 * apriori.mean()).all()
+    assert 0.9 < np.sqrt((inner**2).mean() / (alone**2).mean()) < 1.2
+    assert any("pose priors are not used by datum free" in text for text in free["warnings"])
+
+
+def test_positions_of_a_satellite_receiver_and_what_is_refused(tmp_path):
+    """Positions without rotations are enough, in another frame than the model; one position is not."""
+    project = replace(aerial(8, 120), control=None)
+    turn = exp_rotation(np.array([0.1, 0.2, 1.0]))
+    poses = project.poses.copy()
+    poses[:, :3, 3] = 0.01 * (poses[:, :3, 3] - project.points.mean(0)) @ turn.T
+    poses[:, :3, :3] = turn @ poses[:, :3, :3]
+    write_project(
+        tmp_path, replace(project, poses=poses, points=0.01 * (project.points - project.points.mean(0)) @ turn.T)
+    )
+    _poses_csv(tmp_path / "poses.csv", project, 50, None, range(8))
+    record = adjust_folder(tmp_path, sigma_px=0.3).record
+    assert record["n_observations"] == 2 * len(project.image) + 24
+    error = _points(project, record) - project.points
+    sigma = np.array([{row["id"]: row for row in record["points"]}[str(i)]["sigma_mm"] for i in project.ids]) / 1e3
+    assert np.abs(error / sigma).max() < 5
+    _poses_csv(tmp_path / "one.csv", project, 50, None, [3])
+    with pytest.raises(InfeasibleError, match="pose priors leave 4 of 7 datum parameters open"):
+        adjust_folder(tmp_path, sigma_px=0.3, poses=tmp_path / "one.csv")
+    text = (tmp_path / "poses.csv").read_text()
+    for old, new, words in (
+        ("img 000.jpg,50", "img 000.jpg,0", r"poses\.csv:3: sigma_position_mm: expected a positive number or nothing"),
+        ("img 000.jpg", "img 001.jpg", r"poses\.csv:4: image img 001\.jpg stands in the list twice"),
+        ("img 000.jpg", "other", r"poses\.csv:3: image 'other' is not in the COLMAP model"),
+    ):
+        (tmp_path / "poses.csv").write_text(text.replace(old, new, 1))
+        with pytest.raises(InputError, match=words):
+            adjust_folder(tmp_path, sigma_px=0.3)
+    with pytest.raises(InputError, match="datum poses: expected pose priors, found none"):
+        adjust_folder(tmp_path, sigma_px=0.3, datum="poses", poses=_empty(tmp_path / "empty.csv"))
+
+
+def _empty(path):
+    path.write_text("image,sigma_position_mm,sigma_rotation_deg\n")
+    return path
+
+
+def test_inner_precision_is_the_s_transformation_of_the_joint_covariance(tmp_path):
+    project = aerial(6, 60, control=5)
+    record = _adjusted(tmp_path, project, sigma_px=0.3, datum="control")
+    _, _, _, covariance = dense_sigmas(project, record, "control")
+    first = 6 * 6
+    points = np.array([{row["id"]: row for row in record["points"]}[str(i)]["xyz_mm"] for i in project.ids])
+    unit = np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean())
+    inner = s_transformation(covariance[first:, first:] * unit**2, points, parameters=6)
+    found = np.array([{row["id"]: row for row in record["points"]}[str(i)]["sigma_inner_mm"] for i in project.ids])
+    np.testing.assert_allclose(found / record["sigma0"], np.sqrt(np.diag(inner)).reshape(-1, 3), rtol=1e-8)
+
+
+def test_images_without_points_and_tables_of_a_spreadsheet(tmp_path):
+    """Semicolons, comments, a byte order mark; an image and its camera that saw nothing."""
+    project = part(10, 40)
+    base = _adjusted(tmp_path / "a", project, sigma_px=0.1, datum="scale")
+    blind = replace(
+        project,
+        poses=np.concatenate([project.poses, project.poses[:1]]),
+        names=[*project.names, "unused.jpg"],
+        camera_of_image=np.r_[project.camera_of_image, 1],
+        intrinsics=np.repeat(project.intrinsics, 2, axis=0),
+        models=["OPENCV", "OPENCV"],
+        camera_ids=[1, 2],
+    )
+    write_project(tmp_path / "b", blind)
+    bars = tmp_path / "b" / "scalebars.csv"
+    bars.write_text("\ufeff# lengths of today\n\n" + bars.read_text().replace(",", "; "), encoding="utf-8")
+    record = adjust_folder(tmp_path / "b", sigma_px=0.1, refine=("f",)).record
+    assert record["datum"].startswith("scale")
+    assert len(record["images"]) == 10
+    assert "1 image(s) without image points are left out: unused.jpg" in record["warnings"]
+    again = adjust_folder(tmp_path / "b", sigma_px=0.1).record
+    for a, b in zip(base["points"], again["points"], strict=True):
+        np.testing.assert_allclose(b["sigma_mm"], a["sigma_mm"], rtol=1e-9)

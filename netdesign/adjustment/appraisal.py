@@ -76,8 +76,6 @@ def appraise(
     reduced = reduce_normals(linearised)
     g_camera, g_points = null_space(problem, layout)
     open_ = g_camera.shape[1]
-    if problem.datum in ("control", "fixed", "poses") and open_:
-        raise InfeasibleError(_open_datum(problem, open_))
     parameter_names = free_parameters(problem)
     unknowns = layout.width + 3 * int(layout.eliminated.sum())
     measured = _measured(problem, layout)
@@ -206,15 +204,6 @@ def free_parameters(problem: BundleProblem) -> tuple[str, ...]:
     if len(problem.intrinsics) == 1:
         return problem.refine
     return tuple(f"camera {index + 1} {name}" for index in range(len(problem.intrinsics)) for name in problem.refine)
-
-
-def _open_datum(problem: BundleProblem, open_: int) -> str:
-    if problem.datum == "poses":
-        return f"datum poses: the pose priors leave {open_} of 7 datum parameters open; expected more of them, or bars"
-    return (
-        f"datum {problem.datum}: {int(problem.known().sum())} control point(s) leave {open_} of 7 datum "
-        "parameters open; expected at least 3 that do not lie on one line"
-    )
 
 
 def _datum_text(problem: BundleProblem, mask: Bools, open_: int) -> str:

@@ -213,7 +213,7 @@ def check_input(problem: BundleProblem) -> None:
 
 
 def check_start(problem: BundleProblem) -> None:
-    """Raise on what no adjustment can repair: missing rays, loose blocks, points behind their camera.
+    """Raise on what no adjustment can repair: missing rays, loose blocks, an open datum, points behind their camera.
 
     Raises:
         InfeasibleError: naming the images and points.
@@ -225,6 +225,16 @@ def check_start(problem: BundleProblem) -> None:
     )
     if complaints:
         raise InfeasibleError("; ".join(complaints))
+    open_ = null_space(problem, problem.layout())[0].shape[1]
+    if open_ and problem.datum == "poses":
+        raise InfeasibleError(
+            f"datum poses: the pose priors leave {open_} of 7 datum parameters open; expected more of them, or bars"
+        )
+    if open_ and problem.datum in ("control", "fixed"):
+        raise InfeasibleError(
+            f"datum {problem.datum}: {int(problem.known().sum())} control point(s) leave {open_} of 7 datum "
+            "parameters open; expected at least 3 that do not lie on one line"
+        )
     observations = problem.observations
     _, depth = project(
         problem.world_from_cam[observations.image],

@@ -24,6 +24,7 @@ def adjustment_payload(
     """
     factor = adjustment.sigma0 if np.isfinite(adjustment.sigma0) else 1.0
     sigma = np.sqrt(np.diagonal(adjustment.point_covariance, axis1=1, axis2=2)) * MM
+    inner = np.sqrt(np.maximum(np.diagonal(adjustment.inner_covariance, axis1=1, axis2=2), 0.0)) * MM
     rays, observations = adjustment.rays, adjustment.observations
     position = adjustment.sigma_position * MM
     rotation = np.sqrt(np.diagonal(adjustment.pose_covariance[:, :3, :3], axis1=1, axis2=2))
@@ -49,6 +50,7 @@ def adjustment_payload(
                 "xyz_mm": adjustment.points[j] * MM if adjustment.used[j] else [None] * 3,
                 "sigma_mm": sigma[j] * factor,
                 "sigma_apriori_mm": sigma[j],
+                "sigma_inner_mm": inner[j] * factor,
                 "covariance_mm2": adjustment.point_covariance[j] * (MM * factor) ** 2,
                 "rays": rays[j],
             }

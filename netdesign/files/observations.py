@@ -1,24 +1,22 @@
-"""Observation sets: a COLMAP text model with observations.csv, control.csv and scalebars.csv beside it.
+"""Observation sets: a COLMAP text model, with its image points or with an observations.csv beside it.
 
-Lengths in these files are mm; pixels in observations.csv count from the centre of the top-left pixel. A network folder
-of a run is an observation set too: its observations.csv names tag and corner instead of the point.
+Pixels in observations.csv count from the centre of the top-left pixel. A network folder of a run is an observation set
+too: its observations.csv names tag and corner instead of the point. What carries the datum is in ``datum_tables``.
 """
 
-import csv
-import io
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from netdesign.errors import InputError
 from netdesign.files.colmap import point3d_id, read_model
-from netdesign.model.adjustment import ControlPoints, ScaleBars
+from netdesign.files.csv_table import csv_rows, index_of, numbers
 from netdesign.model.arrays import Floats, Ints
 from netdesign.model.network import Observations
 
-MM = 1e-3
 DEFAULT_SIGMA_PX = 1.0
 
 
@@ -42,6 +40,23 @@ class ObservationSet:
     observations: Observations
     sigma_known: bool
 
+    def without_blind_images(self) -> tuple["ObservationSet", tuple[str, ...]]:
+        """Return the set without the images that have no image point (and their cameras), and their names."""
+        seen = np.bincount(self.observations.image, minlength=len(self.image_names)) > 0
+        if seen.all():
+            return self, ()
+        cameras, camera_of_image = np.unique(self.camera_of_image[seen], return_inverse=True)
+        row = np.cumsum(seen) - 1
+        kept = replace(
+            self,
+            image_names=tuple(name for name, keep in zip(self.image_names, seen, strict=True) if keep),
+            world_from_cam=self.world_from_cam[seen],
+            intrinsics=self.intrinsics[cameras],
+            camera_of_image=camera_of_image.astype(np.int64),
+            observations=replace(self.observations, image=row[self.observations.image].astype(np.int64)),
+        )
+        return kept, tuple(name for name, keep in zip(self.image_names, seen, strict=True) if not keep)
+
 
 def read_observation_set(folder: Path, sigma_px: float | None) -> ObservationSet:
     """Read a COLMAP text model and, if there is one, its observations.csv.
@@ -59,7 +74,7 @@ def read_observation_set(folder: Path, sigma_px: float | None) -> ObservationSet
     for what, count in (("image", len(model.names)), ("point", len(model.point_ids))):
         if count == 0:
             raise InputError(f"{folder}: expected a COLMAP model with {what}s, found none")
-    repeated = sorted({name for name in model.names if model.names.count(name) > 1})
+    repeated = [a for a, b in itertools.pairwise(model.names) if a == b]
     if repeated:
         raise InputError(f"{folder / 'images.txt'}: expected unique image names, found {repeated[0]} twice")
     variance = (DEFAULT_SIGMA_PX if sigma_px is None else sigma_px) ** 2
@@ -87,61 +102,14 @@ def read_observation_set(folder: Path, sigma_px: float | None) -> ObservationSet
     )
 
 
-def csv_rows(path: Path, required: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
-    """Return ("file:line", row) of a CSV file with at least the given columns.
-
-    Raises:
-        InputError: no such file, not text, or a column is missing.
-    """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected UTF-8 text, found {error.reason} at byte {error.start}") from None
-    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
-    names = [name.strip() for name in reader.fieldnames or ()]
-    reader.fieldnames = names
-    missing = [name for name in required if name not in names]
-    if missing:
-        raise InputError(f"{path}:1: expected columns {','.join(required)}, found no {missing[0]}")
-    rows = []
-    for row in reader:
-        where = f"{path}:{reader.line_num}"
-        if None in row or any(value is None for value in row.values()):
-            raise InputError(f"{where}: expected {len(names)} values, found another number of them")
-        rows.append((where, {name: value.strip() for name, value in row.items()}))
-    return rows
-
-
-def _numbers(where: str, row: dict[str, str], names: Sequence[str]) -> list[float]:
-    """Return finite numbers of a row."""
-    values = []
-    for name in names:
-        try:
-            value = float(row[name])
-        except ValueError:
-            value = float("nan")
-        if not np.isfinite(value):
-            raise InputError(f"{where}: {name}: expected a finite number, found {row[name]!r}")
-        values.append(value)
-    return values
-
-
-def _index(where: str, what: str, key: str, table: dict[str, int]) -> int:
-    if key not in table:
-        raise InputError(f"{where}: {what} {key!r} is not in the COLMAP model")
-    return table[key]
-
-
 def _read_observations(
     path: Path, names: Sequence[str], point_ids: Sequence[int], variance: float, override: bool
 ) -> tuple[Observations, bool]:
     """Return the observations and whether their noise is known; ``override`` puts ``variance`` in its place."""
-    with path.open(encoding="utf-8-sig") as file:
-        head = [name.strip() for name in file.readline().split(",")]
-    by_tag = "point" not in head and "tag" in head
-    rows = csv_rows(path, ["image", *(["tag", "corner"] if by_tag else ["point"]), "x_px", "y_px"])
+    rows = csv_rows(path, ["image", "x_px", "y_px"])
+    by_tag = bool(rows) and "point" not in rows[0][1] and {"tag", "corner"} <= set(rows[0][1])
+    if rows and not by_tag and "point" not in rows[0][1]:
+        raise InputError(f"{path}:1: expected columns image,point,x_px,y_px, found no point")
     covariance_columns = ["sxx_px2", "sxy_px2", "syy_px2"]
     given = bool(rows) and all(name in rows[0][1] for name in covariance_columns)
     images = {name: index for index, name in enumerate(names)}
@@ -150,15 +118,15 @@ def _read_observations(
     seen: set[tuple[int, int]] = set()
     for where, row in rows:
         key = row["point"] if not by_tag else _point_of_tag(where, row)
-        pair = _index(where, "image", row["image"], images), _index(where, "point", key, points)
-        xy.append(_numbers(where, row, ["x_px", "y_px"]))
+        pair = index_of(where, "image", row["image"], images), index_of(where, "point", key, points)
+        xy.append(numbers(where, row, ["x_px", "y_px"]))
         if pair in seen:
             raise InputError(f"{where}: point {key} in image {row['image']} is observed twice")
         seen.add(pair)
         image.append(pair[0])
         point.append(pair[1])
         if given and not override:
-            sxx, sxy, syy = _numbers(where, row, covariance_columns)
+            sxx, sxy, syy = numbers(where, row, covariance_columns)
             if not (sxx > 0 and syy > 0 and sxx * syy > sxy * sxy):
                 raise InputError(f"{where}: expected a positive definite covariance, found {sxx}, {sxy}, {syy}")
             covariance.append([[sxx, sxy], [sxy, syy]])
@@ -178,46 +146,3 @@ def _point_of_tag(where: str, row: dict[str, str]) -> str:
     if not (tag.isdigit() and corner in ("0", "1", "2", "3")):
         raise InputError(f"{where}: expected a tag id and a corner 0 to 3, found {tag!r}, {corner!r}")
     return str(point3d_id(int(tag), int(corner)))
-
-
-def read_control(path: Path, point_names: Sequence[str]) -> ControlPoints:
-    """Read control points: point,x_mm,y_mm,z_mm,sigma_mm; sigma 0 = error-free.
-
-    Raises:
-        InputError: with file and line; an unknown or repeated point, a number that is not one, a negative sigma.
-    """
-    table = {name: index for index, name in enumerate(point_names)}
-    columns = ("point", "x_mm", "y_mm", "z_mm", "sigma_mm")
-    index, xyz, sigma = [], [], []
-    for where, row in csv_rows(path, columns):
-        index.append(_index(where, "control point", row["point"], table))
-        values = _numbers(where, row, columns[1:])
-        if values[3] < 0:
-            raise InputError(f"{where}: sigma_mm: expected 0 (error-free) or more, found {values[3]}")
-        if index[-1] in index[:-1]:
-            raise InputError(f"{where}: control point {row['point']} stands in the list twice")
-        xyz.append([value * MM for value in values[:3]])
-        sigma.append(values[3] * MM)
-    return ControlPoints(point=np.array(index, dtype=np.int64), xyz=np.reshape(xyz, (-1, 3)), sigma=np.array(sigma))
-
-
-def read_scale_bars(path: Path, point_names: Sequence[str]) -> ScaleBars:
-    """Read scale bars: a,b,length_mm,sigma_mm; sigma 0 = error-free.
-
-    Raises:
-        InputError: with file and line; an unknown point, a bar from a point to itself, a length that is not positive.
-    """
-    table = {name: index for index, name in enumerate(point_names)}
-    columns = ("a", "b", "length_mm", "sigma_mm")
-    ends, values = [], []
-    for where, row in csv_rows(path, columns):
-        pair = (_index(where, "scale bar end", row["a"], table), _index(where, "scale bar end", row["b"], table))
-        length, sigma = _numbers(where, row, columns[2:])
-        if pair[0] == pair[1]:
-            raise InputError(f"{where}: expected two different points, found {row['a']} twice")
-        if length <= 0 or sigma < 0:
-            raise InputError(f"{where}: expected a positive length and a sigma of 0 or more, found {length}, {sigma}")
-        ends.append(pair)
-        values.append([length * MM, sigma * MM])
-    both, numbers = np.array(ends, dtype=np.int64).reshape(-1, 2), np.reshape(values, (-1, 2))
-    return ScaleBars(a=both[:, 0], b=both[:, 1], length=numbers[:, 0], sigma=numbers[:, 1])

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from netdesign.errors import InputError
-from netdesign.files.observations import csv_rows
+from netdesign.files.csv_table import csv_rows
 from netdesign.files.parts import TAG_COUNT, load_targets
 from netdesign.files.study_text import first_problem, read_toml
 from netdesign.model.camera import Camera

@@ -65,7 +65,9 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if isinstance(value, np.ndarray):
-        return plain(value.tolist())
+        # Whole arrays at once where nothing in them needs care: thousands of points would take seconds one by one.
+        easy = value.dtype == np.float64 and bool(np.isfinite(value).all())
+        return (value + 0.0).tolist() if easy else plain(value.tolist())
     if isinstance(value, np.generic):
         return plain(value.item())
     if isinstance(value, float):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from netdesign.imaging.fit import SQUARE, fit_tag, homography
 from netdesign.imaging.lens import ideal_pixels, measured_pixels
@@ -42,6 +43,33 @@ def test_homography_maps_the_square_and_its_derivative_is_right():
         step[index] = 1e-5
         ahead, behind = (homography(corners + sign * step.reshape(4, 2))[0].ravel()[:8] for sign in (1, -1))
         np.testing.assert_allclose((ahead - behind) / 2e-5, change[:, index], rtol=1e-5, atol=1e-9)
+
+
+def _edge(x, at, sigma):
+    """A step at ``at`` blurred by a Gaussian and integrated over the pixels x, in closed form."""
+
+    def upto(t):
+        return t * norm.cdf(t) + norm.pdf(t)
+
+    return sigma * (upto((x + 0.5 - at) / sigma) - upto((x - 0.5 - at) / sigma))
+
+
+@pytest.mark.parametrize(("cell", "sigma", "limit"), [(4.0, 0.7, 5e-4), (8.0, 0.4, 2e-3), (16.0, 0.7, 3e-3)])
+def test_a_tag_square_to_the_pixel_grid_is_measured_wherever_it_lies_in_the_pixel(cell, sigma, limit):
+    pattern = np.pad(cells("tag36h11", 7), 1, constant_values=1).astype(float)
+    pixels, camera = np.arange(int(12 * cell) + 12), np.array([1000.0, 1000, 0, 0, 0, 0, 0, 0])
+    for shift in ((0.0, 0.0), (0.25, 0.25), (0.13, 0.4), (0.5, 0.25)):
+        start = 2 * cell + 4 + np.array(shift)
+        shares = [
+            -np.diff([_edge(pixels, first + (k - 1) * cell, sigma) for k in range(11)], axis=0) for first in start
+        ]
+        white = np.einsum("ky,kl,lx->yx", shares[1], pattern, shares[0])
+        inside = np.einsum("ky,lx->yx", shares[1], shares[0])
+        corners = start + 8 * cell * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+        picture = 257 * (20 + 215 * white + 160 * (1 - inside))
+        fit = fit_tag(picture, cells("tag36h11", 7), corners + 0.1, camera, 65535 / 1500, 1e6)
+        assert fit.converged
+        assert np.abs(fit.corners_px - corners).max() < limit  # without further smoothing: 0.0025, 0.017, 0.021
 
 
 def test_lens_inverse_and_derivative():

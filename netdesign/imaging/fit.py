@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from netdesign.imaging.lens import ideal_pixels, measured_pixels
-from netdesign.imaging.pattern import FAST, blur, cover, kernel_reach, kernels
+from netdesign.imaging.pattern import FAST, blur, cover, further_box, kernel_reach, kernels
 from netdesign.imaging.tags import CELLS
 from netdesign.model.arrays import Floats
 
@@ -159,6 +159,15 @@ def _grid(x: Floats, y: Floats, intrinsics: Floats, bent: bool) -> Floats:
     return ideal_pixels(grid.reshape(-1, 2), intrinsics).reshape(grid.shape) if bent else grid
 
 
+def _smoothed(corners: Floats) -> float:
+    """Return by how much ``cover`` smooths the two directions of edges, mean variance in sub-pixels squared."""
+    variance = 0.0
+    for along in (corners[1] - corners[0], corners[3] - corners[0]):
+        narrow, wide = np.sort(np.abs(along) / np.linalg.norm(along))
+        variance += 2.0 * further_box(float(wide), float(narrow)) ** 2 / 12.0
+    return 0.5 * variance
+
+
 def fit_tag(
     picture: NDArray[np.generic], cells: NDArray[np.uint8], seed_px: Floats, intrinsics: Floats, gain: float,
     floor: float, max_iterations: int = 20, tolerance_px: float = 2e-4,
@@ -191,7 +200,7 @@ def fit_tag(
         px_from_tag, change = homography(corners)
         tag_from_px = np.linalg.inv(px_from_tag)
         cover(patch.fine[..., 0], patch.fine[..., 1], tag_from_px, cells, side, patch.layers)
-        taps = kernels(sigma, patch.per_pixel, patch.reach)
+        taps = kernels(sigma, patch.per_pixel, patch.reach, _smoothed(corners))
         blur(patch.layers, taps, patch.per_pixel, levels[0], levels[1], levels[2], patch.model)
         chi2, pixels = _normal_equations(
             patch.grey, patch.centres, patch.model, px_from_tag, tag_from_px, px_from_ideal[0], levels, frame,

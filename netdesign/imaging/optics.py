@@ -16,15 +16,20 @@ from netdesign.model.camera import Camera
 Picture = NDArray[np.float32]
 
 
-def pixel_kernel(blur_px: float, supersample: int) -> NDArray[np.float32]:
+def pixel_kernel(blur_px: float, supersample: int, smoothed: float = 0.0) -> NDArray[np.float32]:
     """Return the taps (symmetric, sum 1) of Gaussian blur and pixel integration on the supersampled grid.
 
     The box of the pixel is ``supersample`` equal taps: together with the width of a supersample that is exactly one
     pixel. The Gaussian is sampled; convolving it with a continuous box instead would count the box twice.
+
+    Args:
+        smoothed: variance, in supersamples squared, by which the picture is blurred already beyond the width of a
+            supersample; taken out of the Gaussian.
     """
     reach = int(np.ceil(4.5 * blur_px * supersample))
     offsets = np.arange(-reach, reach + 1) / supersample
-    gaussian = np.exp(-0.5 * (offsets / blur_px) ** 2) if blur_px > 0 else (offsets == 0).astype(float)
+    variance = blur_px**2 - smoothed / supersample**2
+    gaussian = np.exp(-0.5 * offsets**2 / variance) if variance > 0 else (offsets == 0).astype(float)
     taps = np.convolve(gaussian / gaussian.sum(), np.full(supersample, 1 / supersample))
     return taps.astype(np.float32)
 
@@ -62,20 +67,23 @@ def _decimate(
             out[row, column] = total * np.float32(scale)
 
 
-def decimate(fine: NDArray[Any], blur_px: float, supersample: int, first_row: int, rows: int) -> Picture:
+def decimate(
+    fine: NDArray[Any], blur_px: float, supersample: int, first_row: int, rows: int, smoothed: float = 0.0
+) -> Picture:
     """Blur, integrate over pixels and decimate in one separable filter.
 
     Args:
         fine: (r·S, w·S) supersampled light: uint8 with full scale 255, or float32 with full scale 1.
         first_row, rows: the pixel rows wanted, counted from the first row of ``fine``; what the filter sees beyond
             the border is the border's own value.
+        smoothed: as for ``pixel_kernel``.
 
     Returns:
         (rows, w) linear light, full scale 1.
     """
     out = np.empty((rows, fine.shape[1] // supersample), np.float32)
     scale = 1 / 255 if fine.dtype == np.uint8 else 1.0
-    _decimate(fine, pixel_kernel(blur_px, supersample), supersample, first_row, scale, out)
+    _decimate(fine, pixel_kernel(blur_px, supersample, smoothed), supersample, first_row, scale, out)
     return out
 
 

@@ -1,11 +1,11 @@
 """Pictures of a scene through pyrender on EGL: the only file that meets pyrender and OpenGL.
 
 What is done here and why (measured in the project's imaging notes): flat shading, because anything else applies a
-gamma curve and shifts every edge once pixels are averaged; supersampling without multisampling, because texture
-filtering is what smooths a tag and multisampling only costs; vertices in the camera frame with the camera at the
-identity; textures of about one supersample per texel with trilinear mip maps; horizontal bands, so that memory stays
-bounded at any resolution. One OpenGL context per process, used from the thread that made it, never across a fork:
-start worker processes with "spawn".
+gamma curve and shifts every edge once pixels are averaged; supersampling without multisampling, because the shader
+smooths the edges inside a tag and multisampling only costs; vertices in the camera frame with the camera at the
+identity; shaders of our own, because filtered textures alias by 0.02 px on tags that stand square to the pixel grid
+(``shaders/flat.frag``); horizontal bands, so that memory stays bounded at any resolution. One OpenGL context per
+process, used from the thread that made it, never across a fork: start worker processes with "spawn".
 
 Pixel origin: pyrender measures from the corner of the picture, hence +0.5 on the principal point. Camera axes:
 OpenGL's y points up and z backwards, hence the sign change of both in ``_gl``.
@@ -14,6 +14,7 @@ OpenGL's y points up and z backwards, hence the sign change of both in ``_gl``.
 import os
 import warnings
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from netdesign.errors import EnvironmentProblem
 from netdesign.imaging.geometry import FACE_STEP_PX, TagQuad, divided, face_levels, part_triangles, tag_quads
 from netdesign.imaging.looks import Appearance
 from netdesign.imaging.optics import Picture, decimate, margin_px
-from netdesign.imaging.tags import texture
+from netdesign.imaging.tags import CELLS, QUIET_CELLS, texture
 from netdesign.model.arrays import Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.frames import transform
@@ -32,8 +33,11 @@ from netdesign.model.scene import Scene
 PACKAGES = "libegl1 libgl1"  # Debian and Ubuntu; they pull Mesa's software rasteriser
 MAX_SIDE = 16384  # of a render target
 BAND_SAMPLES = 2**25  # supersamples of one band: 270 MB of colour and depth
-# An edge between texels is a ramp one texel wide; at one supersample its aliasing vanishes, at 1.5 it is 0.2.
-SUPERSAMPLES_PER_TEXEL = 1.0
+SHADERS = Path(__file__).parent / "shaders"
+# The shader's smoothing beyond a supersample's own width, supersamples squared: 1/12 of 1 for an edge along the grid,
+# of 0.7 on average for one that leans.
+SMOOTHED = 0.8 / 12
+PADDING = 1  # texels around the quiet zone: rows of 12 bytes, OpenGL wants a multiple of 4
 
 
 def probe() -> str:
@@ -53,7 +57,7 @@ class Renderer:
         """Prepare the scene; the OpenGL context is made at the first picture."""
         self.scene, self.camera, self.supersample = scene, camera, supersample
         self.appearance = appearance or Appearance()
-        self._textures: dict[tuple[int, int], Any] = {}
+        self._textures: dict[int, Any] = {}
         self._divided: dict[float, tuple[Floats, Ints]] = {}
         self._face_level = face_levels(scene.part, self.appearance)
 
@@ -75,7 +79,7 @@ class Renderer:
             for first in range(0, camera.height_px, rows):
                 wanted = min(rows, camera.height_px - first)
                 fine = drawing.band(camera, factor, first - margin, rows + 2 * margin)
-                picture[first : first + wanted] = decimate(fine, camera.blur_px, factor, margin, wanted)
+                picture[first : first + wanted] = decimate(fine, camera.blur_px, factor, margin, wanted, SMOOTHED)
         return picture
 
     def _primitives(self, cam_from_world: Floats) -> list[Any]:
@@ -84,7 +88,7 @@ class Renderer:
         quads = tag_quads(self.scene.targets, self.camera, cam_from_world)
         drawn = [
             primitive(
-                positions=_gl(quad.vertices), texcoord_0=np.asarray(quad.uv, np.float32), indices=quad.faces,
+                positions=_gl(quad.vertices), texcoord_0=_texture_places(quad), indices=quad.faces,
                 material=material(baseColorTexture=self._texture(quad), baseColorFactor=[1.0, 1.0, 1.0, 1.0]),
             )
             for quad in quads
@@ -115,14 +119,17 @@ class Renderer:
         return self._divided[longest]
 
     def _texture(self, quad: TagQuad) -> Any:
-        texels = 4 * round(quad.cell_px * self.supersample / SUPERSAMPLES_PER_TEXEL / 4)
-        texels = min(max(texels, 8), 96)
-        key = (quad.tag, texels)
-        if key not in self._textures:
+        if quad.tag not in self._textures:
             targets, look = self.scene.targets, self.appearance
-            image = texture(targets.family, int(targets.ids[quad.tag]), texels, look.black, look.white)
-            self._textures[key] = _pyrender().Texture(source=image, source_channels="R")
-        return self._textures[key]
+            image = texture(targets.family, int(targets.ids[quad.tag]), PADDING, look.black, look.white)
+            self._textures[quad.tag] = _pyrender().Texture(source=image, source_channels="R")
+        return self._textures[quad.tag]
+
+
+def _texture_places(quad: TagQuad) -> NDArray[np.float32]:
+    """Return where the vertices lie on the texture, which has PADDING around the quiet zone."""
+    side = CELLS + 2 * QUIET_CELLS
+    return np.asarray((quad.uv * side + PADDING) / (side + 2 * PADDING), np.float32)
 
 
 def _gl(vertices: Floats) -> NDArray[np.float32]:
@@ -201,6 +208,7 @@ def _context() -> Any:
     import OpenGL.error
     from OpenGL import GL as gl
     from pyrender.renderer import Renderer as Stock
+    from pyrender.shader_program import ShaderProgramCache
 
     class Slim(Stock):
         """pyrender's renderer with a plain framebuffer: no multisampling, red channel only."""
@@ -258,6 +266,7 @@ def _context() -> Any:
         platform.init_context()
         platform.make_current()
         slim = Slim(64, 64)
+        slim._program_cache = ShaderProgramCache(str(SHADERS))
     except (ImportError, AttributeError, ValueError, OpenGL.error.Error) as error:
         raise _missing(error) from None
     slim.gl, slim.platform = gl, platform

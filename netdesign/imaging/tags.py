@@ -46,14 +46,13 @@ def cells(family: str, tag_id: int) -> NDArray[np.uint8]:
     return pattern
 
 
-def texture(family: str, tag_id: int, texels_per_cell: int, black: float, white: float) -> NDArray[np.uint8]:
-    """Return a square grey texture of the tag with its quiet zone, row 0 at the top.
+def texture(family: str, tag_id: int, padding: int, black: float, white: float) -> NDArray[np.uint8]:
+    """Return the tag with its quiet zone as a square grey picture, one texel per cell, row 0 at the top.
 
     Args:
-        texels_per_cell: texels along one cell; the side is 10 cells.
-        black, white: linear levels in [0, 1].
+        padding: more white cells around the quiet zone.  black, white: linear levels in [0, 1].
     """
-    levels = np.full((CELLS + 2 * QUIET_CELLS,) * 2, round(255 * white), np.uint8)
-    inside = slice(QUIET_CELLS, QUIET_CELLS + CELLS)
-    levels[inside, inside] = np.where(cells(family, tag_id) == 1, round(255 * white), round(255 * black))
-    return np.kron(levels, np.ones((texels_per_cell, texels_per_cell), np.uint8))
+    rim = QUIET_CELLS + padding
+    levels = np.full((CELLS + 2 * rim,) * 2, round(255 * white), np.uint8)
+    levels[rim:-rim, rim:-rim] = np.where(cells(family, tag_id) == 1, round(255 * white), round(255 * black))
+    return levels

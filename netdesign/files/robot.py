@@ -1,6 +1,5 @@
 """The [robot] table: from names and paths to a RobotCell, and a user's URDF packed into the run directory."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +10,9 @@ from netdesign.model.arrays import Floats
 from netdesign.model.frames import pose, rotation_from_rpy
 from netdesign.model.study import RobotTable
 from netdesign.model.task import RobotCell
+from netdesign.motion.urdf import bundled_urdf
 
 MM = 1e-3
-MESH_ATTRIBUTE = re.compile(r'<mesh[^>]*\bfilename="([^"]+)"')
 
 
 def resolve_cell(table: RobotTable, folder: Path) -> RobotCell:
@@ -68,22 +67,11 @@ def bundle_robot(table: RobotTable, folder: Path) -> tuple[RobotTable, dict[str,
     if table.urdf is None:
         return table, {}
     urdf = _urdf(table, folder)
-    packages = [resolve_path(entry, folder) for entry in table.package_dirs]
-    files = {"inputs/robot/robot.urdf": urdf.read_bytes()}
-    for name in sorted(set(MESH_ATTRIBUTE.findall(urdf.read_text(encoding="utf-8")))):
-        if name.startswith("package://"):
-            below = name.removeprefix("package://")
-            found = [package / below for package in packages if (package / below).is_file()]
-            if found:
-                files[f"inputs/robot/packages/{below}"] = found[0].read_bytes()
-            elif not (share_folder() / below).is_file():
-                raise InputError(f"{urdf}: mesh {name} is in none of robot.package_dirs")
-        elif (urdf.parent / name).is_file():
-            files[f"inputs/robot/{Path(name).as_posix()}"] = (urdf.parent / name).read_bytes()
-        else:
-            raise InputError(f"{urdf}: mesh {name}: no such file")
-    update = {"urdf": "inputs/robot/robot.urdf", "package_dirs": ("inputs/robot/packages",) if packages else ()}
-    return table.model_copy(update=update), files
+    packages = tuple(resolve_path(entry, folder) for entry in table.package_dirs)
+    text, meshes = bundled_urdf(urdf, (*packages, share_folder()), share_folder())
+    files = {"inputs/robot/robot.urdf": text.encode()}
+    files |= {f"inputs/robot/{name}": mesh.read_bytes() for name, mesh in meshes.items()}
+    return table.model_copy(update={"urdf": "inputs/robot/robot.urdf", "package_dirs": ()}), files
 
 
 def _urdf(table: RobotTable, folder: Path) -> Path:

@@ -69,6 +69,8 @@ def load_arm(cell: RobotCell, sphere: ViewingSphere, part: Part) -> ArmCell:
             f"robot.joint_weights: expected {len(chain)} numbers ({', '.join(chain.joint_names)}), "
             f"found {len(cell.joint_weights)}"
         )
+    if cell.joint_weights is not None and not any(cell.joint_weights):
+        raise InputError("robot.joint_weights: expected a weight above 0, found none")
     placements = np.array(chain.placements)
     placements[0] = cell.world_from_base @ placements[0]
     last_from_cam = chain.last_from_flange @ cell.flange_from_cam

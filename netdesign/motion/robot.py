@@ -7,6 +7,9 @@ is turned so that its joint rotates about its own z axis, so that the kernels ne
 """
 
 import importlib.metadata
+import os
+import re
+import tempfile
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -14,12 +17,13 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from scipy.spatial import ConvexHull
 
 from netdesign.errors import EnvironmentProblem, InputError
 from netdesign.model.arrays import Bools, Floats, Ints, frozen
 from netdesign.model.frames import inverse, pose, skew
 from netdesign.model.task import RobotCell
+from netdesign.motion.shapes import triangles
+from netdesign.motion.urdf import prepared_urdf
 
 # Frame of the bare flange of the arms of example-robot-data; tool0 and flange are ROS-Industrial's names (REP 199).
 _FLANGES = {
@@ -107,7 +111,7 @@ def find_robot(name: str) -> tuple[Path, tuple[Path, ...], str | None]:
     found = known.get(f"{name}_robot") or known.get(name)
     if found is None:
         names = sorted({stem.removesuffix("_robot") for stem in known})
-        near = get_close_matches(name, names, n=4, cutoff=0.4) or names
+        near = get_close_matches(name, names, n=4, cutoff=0.4) or ["ur3", "ur5", "ur10", *_FLANGES]
         raise InputError(f"robot.name: expected a robot of example-robot-data ({', '.join(near)}, …), found {name!r}")
     urdf = Path(str(found.locate())).resolve()
     # package://example-robot-data/robots/… is resolved against the folder that holds the package's folder.
@@ -134,14 +138,7 @@ def load_chain(cell: RobotCell) -> Chain:
     Raises:
         InputError: no such file, not a URDF, a missing mesh, an unknown frame or joint, a joint that does not rotate.
     """
-    if not cell.urdf.is_file():
-        raise InputError(f"robot.urdf: expected a URDF file, found no file {cell.urdf}")
-    try:
-        model = pin.buildModelFromUrdf(str(cell.urdf))
-        folders = [str(folder) for folder in (*cell.package_dirs, cell.urdf.parent)]
-        geometry = pin.buildGeomFromUrdf(model, str(cell.urdf), pin.GeometryType.COLLISION, package_dirs=folders)
-    except ValueError as error:
-        raise InputError(f"robot.urdf: {cell.urdf.name}: {' '.join(str(error).split())}") from None
+    model, geometry = _loaded(cell)
     model, geometry, tool = _reduce(model, geometry, _tool_frame(model, cell), cell)
     joints = list(range(1, model.njoints))
     _check_serial(model, cell)
@@ -169,6 +166,31 @@ def load_chain(cell: RobotCell) -> Chain:
         controller_from_base=inverse(base_from_controller),
         shapes=_shapes(model, geometry, tool, turned),
     )
+
+
+def _loaded(cell: RobotCell) -> tuple[Any, Any]:
+    """Return pinocchio's model and collision geometry."""
+    text = prepared_urdf(cell.urdf, cell.package_dirs, cell.limits)
+    complaints = tempfile.TemporaryFile()
+    stderr = os.dup(2)
+    os.dup2(complaints.fileno(), 2)  # urdfdom says there, in C++, what is wrong
+    try:
+        model = pin.buildModelFromXML(text)
+        geometry = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
+    except ValueError as error:
+        complaints.seek(0)
+        found = re.findall(r"Error: *(.+)", complaints.read().decode(errors="replace"))
+        reason = found[0] if found else " ".join(str(error).split())
+        raise InputError(f"robot.urdf: {cell.urdf.name}: {reason}") from None
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        complaints.close()
+    if not geometry.geometryObjects:
+        raise InputError(
+            f"robot.urdf: {cell.urdf.name}: expected collision geometry (meshes, boxes, cylinders, spheres), found none"
+        )
+    return model, geometry
 
 
 def _tool_frame(model: Any, cell: RobotCell) -> str:
@@ -205,12 +227,18 @@ def _check_serial(model: Any, cell: RobotCell) -> None:
     for index in range(1, model.njoints):
         kind = model.joints[index].shortname()
         if model.joints[index].nv != 1 or "JointModelR" not in kind:
+            found = "a prismatic one" if kind.startswith("JointModelP") else kind.removeprefix("JointModel")
             raise InputError(
                 f"robot.urdf: {cell.urdf.name}: joint {model.names[index]}: expected a revolute or continuous joint, "
-                f"found {kind.removeprefix('JointModel')}; lock it"
+                f"found {found}; lock it"
             )
-    if model.nv > 7:
-        raise InputError(f"robot.urdf: {cell.urdf.name}: expected at most 7 moving joints, found {model.nv}; lock some")
+    if not 6 <= model.nv <= 7:
+        names = ", ".join(list(model.names)[1:])
+        advice = "; lock some (robot.lock)" if model.nv > 7 else ": too few to reach a pose"
+        raise InputError(
+            f"robot.urdf: {cell.urdf.name}: expected 6 or 7 joints that move the camera, "
+            f"found {model.nv} ({names}){advice}"
+        )
 
 
 def _axis(model: Any, joint: int) -> Floats:
@@ -241,7 +269,8 @@ def _limits(model: Any, names: tuple[str, ...], cell: RobotCell) -> tuple[Floats
         )
         low, high = cell.limits.get(name, (low, high))
         if not (np.isfinite([low, high]).all() and low < high):
-            raise InputError(f"robot.limits_rad.{name}: expected low < high, found [{low:g}, {high:g}]")
+            source = "" if name in cell.limits else f" in {cell.urdf.name}; set robot.limits_rad"
+            raise InputError(f"robot.limits_rad.{name}: expected low < high, found [{low:g}, {high:g}]{source}")
         lower[index], upper[index] = low, high
     unknown = sorted(set(cell.limits) - set(names))
     if unknown:
@@ -260,36 +289,8 @@ def _shapes(model: Any, geometry: Any, tool: int, turned: list[Floats]) -> tuple
     for item in geometry.geometryObjects:
         if item.parentJoint == last and item.parentFrame not in ancestors:
             continue
-        vertices, faces = _triangles(item.geometry, item.name)
+        vertices, faces = triangles(item.geometry, item.name)
         link_from_shape = inverse(turned[item.parentJoint]) @ item.placement.homogeneous
         moved = vertices @ link_from_shape[:3, :3].T + link_from_shape[:3, 3]
         shapes.append(LinkShape(name=item.name, link=item.parentJoint, vertices=moved, faces=faces))
     return tuple(shapes)
-
-
-def _triangles(shape: Any, name: str) -> tuple[Floats, Ints]:
-    """Return vertices (v, 3) and faces (t, 3) of a collision shape; a round one is covered from outside."""
-    kind = type(shape).__name__
-    if kind.startswith("BVHModel"):
-        corners = [shape.tri_indices(index) for index in range(shape.num_tris)]
-        faces = [[corner[0], corner[1], corner[2]] for corner in corners]
-        return np.array(shape.vertices()), np.array(faces, dtype=np.int64)
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
-    if kind == "Box":
-        return _hull(signs * np.asarray(shape.halfSide))
-    if kind in ("Cylinder", "Cone", "Capsule", "Sphere"):
-        half = getattr(shape, "halfLength", 0.0) + (shape.radius if kind in ("Capsule", "Sphere") else 0.0)
-        angles = np.arange(16) * (_TURN / 16)
-        ring = shape.radius / np.cos(np.pi / 16) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        return _hull(np.array([[x, y, z] for x, y in ring for z in (-half, half)]))
-    raise InputError(f"robot.urdf: {name}: expected a mesh, box, cylinder, capsule or sphere, found {kind}")
-
-
-def _hull(points: Floats) -> tuple[Floats, Ints]:
-    hull = ConvexHull(points)
-    faces = hull.simplices.astype(np.int64)
-    corners = points[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, [0, 2, 1]]
-    return points, faces

@@ -25,7 +25,7 @@ from netdesign.model.frames import look_at, sphere_directions
 from netdesign.model.progress import Progress, silent
 from netdesign.model.scene import CORNERS_PER_TAG, Part, Scene, Targets
 from netdesign.photogrammetry.collinearity import project
-from netdesign.photogrammetry.precision import corner_sigma
+from netdesign.photogrammetry.precision import corner_rms
 
 SIDES_PX = (20.0, 30.0, 50.0, 85.0, 140.0)
 INCIDENCES_DEG = (0.0, 35.0, 60.0)
@@ -198,7 +198,7 @@ def _measure_cell(job: tuple[Camera, Shoot, float, float, int, int]) -> tuple[No
     outward = truth - truth.mean(axis=1, keepdims=True)
     outward /= np.linalg.norm(outward, axis=2, keepdims=True)
     inward = -np.einsum("kcx,kcx->kc", e.reshape(-1, 4, 2), outward[np.array(of_tag, dtype=np.int64)])
-    shape = corner_sigma(replace(bench, corner_noise=CornerNoise(k=1.0, floor_px=0.0)), side, np.radians(incidence_deg))
+    shape = corner_rms(replace(bench, corner_noise=CornerNoise(k=1.0, floor_px=0.0)), side, np.radians(incidence_deg))
     bias = e.reshape(-1, 2).mean(axis=0) if len(e) else np.full(2, np.nan)
     cell = NoiseCell(
         side_px=side, incidence_deg=incidence_deg, tags=len(e), missed=missed, rejected=rejected,

@@ -14,6 +14,7 @@ import numpy as np
 
 from netdesign.adjustment.bundle import adjust
 from netdesign.adjustment.compare import compare
+from netdesign.adjustment.correlated import correlated_covariance
 from netdesign.adjustment.estimate import estimate
 from netdesign.adjustment.lengths import length_test
 from netdesign.adjustment.problem import BundleProblem
@@ -30,6 +31,7 @@ from netdesign.model.frames import exp_rotation, pose
 from netdesign.model.network import Observations
 from netdesign.model.progress import Progress, silent
 from netdesign.model.results import PointPrecision
+from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.photogrammetry.limited_error import limited_covariance
 from netdesign.photogrammetry.precision import sighting_sigma
@@ -78,7 +80,7 @@ def prove_network(
     point_ids = task.scene.targets.point_ids
     paths = photograph(task, network, folder, repeat, executor)
     measured = measure_images(paths, task.camera, task.scene.targets, gates=_gates(task), executor=executor)
-    observations, _, unused = observations_of(measured, task.scene.targets)
+    observations, tag_covariances, unused = observations_of(measured, task.scene.targets)
     write_text(folder / "observations.csv", observations_csv(observations, names, point_ids))
     record: dict[str, Any] = {
         "network": network.id,
@@ -89,9 +91,10 @@ def prove_network(
     }
     try:
         adjustment = _adjusted(task, network, observations, names)
+        joint = correlated_covariance(adjustment, _by_image_and_tag(observations, tag_covariances))
         limited, total = predictions(task, network)
         truth = task.scene.targets.points
-        validation = compare(truth, adjustment, limited, total, level, seed=task.study.seed)
+        validation = compare(truth, adjustment, limited, total, level, seed=task.study.seed, joint_covariance=joint)
         lengths = length_payload(length_test(truth, adjustment), point_ids)
     except EnvironmentProblem:
         raise
@@ -167,6 +170,13 @@ def _adjusted(task: Task, network: PlannedNetwork, observations: Observations, n
     )
     # Only the first adjustment knows which points lost their rays to its outlier test.
     return replace(adjustment, rejected=cleaned.rejected, warnings=cleaned.warnings)
+
+
+def _by_image_and_tag(observations: Observations, covariances: list[Floats]) -> dict[tuple[int, int], Floats]:
+    """Return the covariances of tags by (image, tag) where observations are listed tag by tag."""
+    image, point = observations.image[::CORNERS_PER_TAG], observations.point[::CORNERS_PER_TAG]
+    keys = zip(image.tolist(), (point // CORNERS_PER_TAG).tolist(), strict=True)
+    return dict(zip(keys, covariances, strict=True))
 
 
 def _gates(task: Task) -> Gates:

@@ -15,7 +15,7 @@ from netdesign.imaging.tags import cells
 from netdesign.model.camera import CornerNoise
 from netdesign.model.frames import inverse, look_at, sphere_directions
 from netdesign.photogrammetry.collinearity import project
-from netdesign.photogrammetry.precision import corner_sigma
+from netdesign.photogrammetry.precision import corner_rms, corner_sigma
 from tests.scenes import CAMERA, plate_scene
 
 CAM = replace(
@@ -156,7 +156,25 @@ def test_covariance_is_the_scatter_of_repeated_pictures(light):
     noise = replace(CAM, corner_noise=CornerNoise(k=3.27, floor_px=0.0005))
     edge, incidence = 1500 * 0.02 / 0.4, np.radians(30)
     # 12.5 % is the closed form's worst case, 2 % the sample's.
-    assert errors.std() == pytest.approx(corner_sigma(noise, edge, incidence), rel=0.15)
+    assert errors.std() == pytest.approx(corner_rms(noise, edge, incidence), rel=0.15)
+
+
+@pytest.mark.parametrize("degrees", [0, 35, 50, 62])
+def test_the_round_error_of_the_design_has_the_information_of_the_fitted_corners(degrees):
+    camera = replace(CAM, distortion=np.zeros(4), corner_noise=CornerNoise(k=1.0, floor_px=0.0))
+    side, ratios = 1500 * 0.02 / 0.4, []
+    for azimuth in (10.0, 100.0, 250.0):
+        pose = look_at(0.4 * sphere_directions(np.radians([azimuth, 90.0 - degrees])), np.zeros(3), 0.3)
+        picture = ReferenceRenderer(SCENE, camera).render(inverse(pose))
+        truth = project(pose, SCENE.targets.points, camera.intrinsics)[0].reshape(-1, 4, 2)
+        for tag in range(4):
+            fit = fit_tag(255 * picture, cells("tag36h11", tag), truth[tag], camera.intrinsics, GAIN, FLOOR)
+            for corner in range(4):
+                block = fit.covariance_px2[2 * corner : 2 * corner + 2, 2 * corner : 2 * corner + 2]
+                ratios.append(np.sqrt(4.0 / (np.trace(np.linalg.inv(block)) * np.trace(block))))
+    incidence = np.radians(degrees)
+    expected = corner_sigma(camera, side, incidence) / corner_rms(camera, side, incidence)
+    assert np.mean(ratios) == pytest.approx(expected, rel=0.04)
 
 
 def test_uneven_light_is_part_of_the_model(light):

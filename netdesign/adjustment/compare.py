@@ -43,6 +43,7 @@ def compare(
     total: PointPrecision,
     level: float = LEVEL,
     seed: int = 0,
+    joint_covariance: Floats | None = None,
 ) -> Validation:
     """Return the verdict on one network.
 
@@ -51,6 +52,8 @@ def compare(
         adjustment: free datum, with its joint covariance (``bundle.adjust``).
         limited, total: predictions at design (P0, P1), for the same m points.
         level: of the intervals.  seed: of the draws for coverage and NEES.
+        joint_covariance: Σ (3m, 3m) m² where it is not the adjustment's own, as when image points are correlated
+            (``correlated``).
 
     Raises:
         InfeasibleError: fewer than four points have an estimate, or the network has no redundancy.
@@ -69,7 +72,8 @@ def compare(
     # Back to the adjustment's own axes and unit, in which its covariance is expressed.
     error = (aligned - truth[used]) @ rotation / scale
     rows = np.repeat(used, 3)
-    joint = adjustment.joint_covariance[np.ix_(rows, rows)]
+    whole = adjustment.joint_covariance if joint_covariance is None else joint_covariance
+    joint = whole[np.ix_(rows, rows)]
     values, vectors = np.linalg.eigh(joint)
     values = np.maximum(values, 0.0)
     nu, r = 3 * count - 7, adjustment.redundancy

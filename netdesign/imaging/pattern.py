@@ -88,22 +88,21 @@ def _thrice(t: float, wide: float, narrow: float) -> float:
     if t <= 0.0:
         return below
     middle = at_ramp + inner * (square_at_ramp + inner * (0.25 - inner / (3.0 * wide)))
-    return 2.0 * middle + 0.5 * t * t - below
+    return float(2.0 * middle + 0.5 * t * t - below)
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def _smooth(t: float, wide: float, narrow: float, box: float) -> float:
     """Integral to t of that trapezoid convolved with two boxes of width ``box``."""
     if box == 0.0:
-        return _once(t, wide, narrow)
+        return float(_once(t, wide, narrow))
     reach = 0.5 * (wide + narrow) + box
     if t >= reach:
         return 1.0
     if t <= -reach:
         return 0.0
-    return (_thrice(t + box, wide, narrow) - 2.0 * _thrice(t, wide, narrow) + _thrice(t - box, wide, narrow)) / (
-        box * box
-    )
+    bent = _thrice(t + box, wide, narrow) - 2.0 * _thrice(t, wide, narrow) + _thrice(t - box, wide, narrow)
+    return float(bent / (box * box))
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)

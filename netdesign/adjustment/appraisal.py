@@ -96,13 +96,13 @@ def appraise(
     parameter_covariance = covariance.camera[first:last, first:last]
     _refuse(calibration_complaints(problem, parameter_names, parameter_covariance))
     numbers = redundancy_numbers(redundancy_matrices(linearised, reduced, camera_side.inverse))
-    used = layout.eliminated | layout.kept | problem.known()
+    used = (layout.eliminated | layout.kept | problem.known()) & ~lost
     blocks = [covariance.points * unit**2, inner * unit**2]
     for block in blocks:
-        block[~used | lost] = np.inf
+        block[~used] = np.inf
     joint = None if covariance.joint is None else covariance.joint * unit**2
     if joint is not None:
-        without = np.repeat(~used | lost, 3)
+        without = np.repeat(~used, 3)
         joint[without, without] = np.inf
     turn = np.r_[np.ones(3), np.full(3, unit)]  # rotations have no unit of length
     pose_blocks = covariance.camera[:first, :first].reshape(layout.images, 6, layout.images, 6)

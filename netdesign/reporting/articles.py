@@ -47,6 +47,7 @@ def article(record: RunRecord, network: NetworkRecord, picture: bytes) -> Values
         "bars": charts.dot_chart(proof.bars(network), "µm"),
         "bars_caption": "Rms sigma per coordinate over all object points.",
         "proof": proof.network_proof(network),
+        "lengths": proof.length_proof(network),
         "thumbnails": [{"name": name, "uri": uri("jpeg", content)} for name, content in network.thumbnails],
         "tour": _tour(record, network),
         "datum_note": f"Limited: {words.LIMITED_DATUM}. Total: datum {network.datum}.",

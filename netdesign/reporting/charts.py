@@ -55,7 +55,7 @@ def interval_chart(rows: Sequence[IntervalRow], level: str) -> Markup:
             f'<text class="value {state}" x="{width - right + 12}" y="{y + 4:.1f}">{row.value:.3f} '
             f"{'✓' if row.inside else '✗'}</text>"
         )
-    return _svg(width, bottom + 20, parts, f"Statistics inside their {level} intervals")
+    return svg(width, bottom + 20, parts, f"Statistics inside their {level} intervals")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +105,7 @@ def band_chart(rows: Sequence[BandRow]) -> Markup:
             f'<text class="value {state}" x="{width - right + 12}" y="{y + 4:.1f}">{row.value:.3f} '
             f"{'✓' if row.inside else '✗'}</text>"
         )
-    return _svg(width, bottom + 20, parts, "Estimates with 90 % intervals inside their margins")
+    return svg(width, bottom + 20, parts, "Estimates with 90 % intervals inside their margins")
 
 
 def dot_chart(rows: Sequence[tuple[str, str, float, str]], unit: str) -> Markup:
@@ -126,7 +126,7 @@ def dot_chart(rows: Sequence[tuple[str, str, float, str]], unit: str) -> Markup:
             f'<rect class="{kind}" x="{left}" y="{y - 8:.1f}" width="{length:.1f}" height="14" rx="3"/>'
             f'<text class="value" x="{left + length + 8:.1f}" y="{y + 4:.1f}">{words}</text>'
         )
-    return _svg(width, top + step * len(rows) + 4, parts, "Predicted and achieved")
+    return svg(width, top + step * len(rows) + 4, parts, "Predicted and achieved")
 
 
 def line_chart(x: Sequence[float], y: Sequence[float], x_name: str, y_name: str) -> Markup:
@@ -154,7 +154,7 @@ def line_chart(x: Sequence[float], y: Sequence[float], x_name: str, y_name: str)
         f'<text class="tick" x="{(left + width) // 2}" y="{height - 3}" text-anchor="middle">{escape(x_name)}</text>',
         f'<text class="tick" x="{left + 8}" y="{top + 7}">{escape(y_name)}</text>',
     ]
-    return _svg(width, height, parts, f"{y_name} against {x_name}")
+    return svg(width, height, parts, f"{y_name} against {x_name}")
 
 
 def histogram_chart(values: Sequence[float], name: str, bins: int) -> Markup:
@@ -189,7 +189,7 @@ def histogram_chart(values: Sequence[float], name: str, bins: int) -> Markup:
         f'<text class="tick" x="{left}" y="{height - 8}">0</text>',
         f'<text class="tick" x="{width - left}" y="{height - 8}" text-anchor="end">1</text>',
     ]
-    return _svg(width, height, parts, f"Histogram of the probability integral transform of {name}")
+    return svg(width, height, parts, f"Histogram of the probability integral transform of {name}")
 
 
 def _ticks(low: float, high: float) -> list[float]:
@@ -200,7 +200,8 @@ def _ticks(low: float, high: float) -> list[float]:
     return [tick for tick in chosen if low <= tick <= high]
 
 
-def _svg(width: float, height: float, parts: Sequence[str], title: str) -> Markup:
+def svg(width: float, height: float, parts: Sequence[str], title: str) -> Markup:
+    """Return a picture of the given parts; the title is read aloud."""
     # Every text that comes from outside has been escaped where it was put in.
     body = "".join(parts)
     return Markup(

@@ -1,10 +1,12 @@
 """Predicted against achieved: what the validation of one network says, and of the campaign."""
 
+from math import ceil
 from typing import Any
 
 from markupsafe import Markup
 
 from netdesign.reporting import charts, words
+from netdesign.reporting.length_chart import length_chart
 from netdesign.reporting.record import NetworkRecord, RunRecord
 
 Values = dict[str, Any]
@@ -38,6 +40,23 @@ def network_proof(network: NetworkRecord) -> Values | None:
         f"ρ has about {content['nu_eff']:.0f} effective degrees of freedom. Datum: {content['datum']}."
     )
     return {"chart": charts.interval_chart(interval_rows(content["statistics"]), level), "caption": caption}
+
+
+def length_proof(network: NetworkRecord) -> Values | None:
+    """Return chart and caption of the length measurement errors, None where there are none."""
+    test = (network.validation or {}).get("length_test")
+    if test is None or test["longest_share_of_diagonal"] is None:
+        return None
+    lengths = test["lengths"]
+    inside = sum(abs(row["error_um"]) <= row["u95_um"] for row in lengths if row["u95_um"] is not None)
+    lines = len({row["line"] for row in lengths})
+    caption = (
+        f"In the manner of VDI/VDE 2634 part 1: {len(lengths)} lengths along {lines} lines, the longest "
+        f"{100 * test['longest_share_of_diagonal']:.0f} % of the volume's diagonal. Dots: error; bars: ± U95 (k = 2), "
+        f"predicted from the full covariance. {inside} of {len(lengths)} lie inside; of independent lengths at least "
+        f"{ceil(test['acceptance_low'] * len(lengths) - 1e-9)} would in 99 % of all cases. Scale: {test['scale']}."
+    )
+    return {"chart": length_chart(lengths), "caption": caption}
 
 
 def interval_rows(statistics: Values) -> list[charts.IntervalRow]:

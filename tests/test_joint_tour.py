@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 
+from netdesign.model.compiled import entry
 from netdesign.model.frames import sphere_directions
 from netdesign.motion.exact_tour import exact_joint_tour
 from netdesign.motion.joint_tour import (
@@ -24,11 +25,11 @@ from tests.cells import joint_map, reachable_viewpoints
 
 NO_LABEL, NOTHING = np.empty((0, 0), dtype=np.int64), np.empty((0, 0, 0, 0))
 
+TOUR = entry()(network_tour)
+
 
 def tour_of(of_map, timed, dwell, drawn):
-    return network_tour(
-        of_map.arrays, law_of(of_map.arm), timed, dwell, drawn, *search_work_for(of_map.arrays, len(drawn))
-    )
+    return TOUR(of_map.arrays, law_of(of_map.arm), timed, dwell, drawn, *search_work_for(of_map.arrays, len(drawn)))
 
 
 def instance(n, seed, most=4):

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from netdesign.model.compiled import entry
 from netdesign.model.frames import exp_rotation, look_at, pose, sphere_directions
 from netdesign.photogrammetry.limited_error import (
     LANES,
@@ -27,6 +28,9 @@ def stations(count, seed, distance=0.6):
     return viewpoints, look_at(distance * sphere_directions(viewpoints), np.zeros(3), rng.uniform(-3, 3, count))
 
 
+ADD_FOUR, VARIANCES = entry()(add_four_cameras), entry()(variances_from_moments)
+
+
 def moment_variances(viewpoints, points, visible, radius, focal, sigma):
     """(m, 3) by the moment form."""
     flat, count = blocked(points.T), len(points)
@@ -36,8 +40,8 @@ def moment_variances(viewpoints, points, visible, radius, focal, sigma):
     weights = np.concatenate([visible / sigma**2, np.zeros((filled, count))])
     for first in range(0, len(directions), 4):
         rows = slice(first, first + 4)
-        add_four_cameras(moments, flat, directions[rows], blocked(weights[rows]), radius)
-    weak = variances_from_moments(moments, flat, radius, count, variances)
+        ADD_FOUR(moments, flat, directions[rows], blocked(weights[rows]), radius)
+    weak = VARIANCES(moments, flat, radius, count, variances)
     return variances.reshape(-1, 3, LANES).transpose(0, 2, 1).reshape(-1, 3)[:count] / focal**2, weak
 
 

@@ -11,10 +11,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy import ndimage
 
 from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.compiled import entry, part
 from netdesign.model.scene import Part
 from netdesign.motion.kinematics import flange_of, link_poses
 
@@ -92,7 +92,7 @@ def part_field(part: Part) -> tuple[Floats, Floats, float]:
     return np.ascontiguousarray(field, dtype=np.float64), low, step
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _segment_segment(p, q):  # type: ignore[no-untyped-def]
     """Return the squared distance of the segments p[0:3]–p[3:6] and q[0:3]–q[3:6].
 
@@ -116,7 +116,7 @@ def _segment_segment(p, q):  # type: ignore[no-untyped-def]
     return dx * dx + dy * dy + dz * dz
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _box_distance(box, x, y, z):  # type: ignore[no-untyped-def]
     dx = max(abs(x - box[0]) - box[3], 0.0)
     dy = max(abs(y - box[1]) - box[4], 0.0)
@@ -124,7 +124,7 @@ def _box_distance(box, x, y, z):  # type: ignore[no-untyped-def]
     return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _field_distance(field, origin, step, x, y, z):  # type: ignore[no-untyped-def]
     """Return a lower bound of the distance to the part: the field inside it, the way to it and its pad outside."""
     outside = 0.0
@@ -141,7 +141,7 @@ def _field_distance(field, origin, step, x, y, z):  # type: ignore[no-untyped-de
     return field[index[0], index[1], index[2]]
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def touches_box(p, radius, box):  # type: ignore[no-untyped-def]
     """Return whether a point of the segment p (6,) is nearer than ``radius`` to a box (centre, half edges)."""
     dx, dy, dz = p[3] - p[0], p[4] - p[1], p[5] - p[2]
@@ -157,7 +157,7 @@ def touches_box(p, radius, box):  # type: ignore[no-untyped-def]
         walked = min(walked + max(gap, _SHORTEST_STEP), length)
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def touches_field(p, radius, field, origin, step):  # type: ignore[no-untyped-def]
     """Return whether a point of the segment p (6,) may be nearer than ``radius`` to the part."""
     dx, dy, dz = p[3] - p[0], p[4] - p[1], p[5] - p[2]
@@ -173,7 +173,7 @@ def touches_field(p, radius, field, origin, step):  # type: ignore[no-untyped-de
         walked = min(walked + max(gap, _SHORTEST_STEP), length)
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _place(body, q, links, placed):  # type: ignore[no-untyped-def]
     """Write world_from_link into links (r, 3, 4) and the capsules' ends in the world into placed (c, 6)."""
     link_poses(body.placements, q, links)
@@ -189,7 +189,7 @@ def _place(body, q, links, placed):  # type: ignore[no-untyped-def]
                     placed[c, 3 * end + a] = m[a, 0] * x + m[a, 1] * y + m[a, 2] * z + m[a, 3]
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def overlapping(body, joints):  # type: ignore[no-untyped-def]
     """Return in how many of joints (n, r) each of the body's pairs (s,) overlaps."""
     links, placed = np.empty((joints.shape[1], 3, 4)), np.empty((body.capsules.shape[0], 6))
@@ -204,7 +204,7 @@ def overlapping(body, joints):  # type: ignore[no-untyped-def]
     return hits
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def configuration_state(body, q, links, placed):  # type: ignore[no-untyped-def]
     """Return FREE, SELF, PART, OBSTACLE or SIGHT for joints q (r,).
 
@@ -243,7 +243,7 @@ def configuration_state(body, q, links, placed):  # type: ignore[no-untyped-def]
     return FREE
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def states(body, joints):  # type: ignore[no-untyped-def]
     """Return the state (n,) int8 of joints (n, r)."""
     n, r = joints.shape
@@ -254,7 +254,7 @@ def states(body, joints):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def leg_state(body, start, end, step):  # type: ignore[no-untyped-def]
     """Return the first state that is not FREE on the straight joint line, ends included; the view may be blocked.
 

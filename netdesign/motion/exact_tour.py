@@ -4,12 +4,12 @@ Time n² K² 2ⁿ: meant for n K up to about 80. Source: M. Held, R. M. Karp, J.
 """
 
 import numpy as np
-from numba import njit
 
+from netdesign.model.compiled import entry
 from netdesign.motion.joint_tour import legs_along
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def exact_joint_tour(options, count, label, barred, law, timed):  # type: ignore[no-untyped-def]
     """Return (closed tour (n + 1,) with the dummy in front, choice (n,), length), arguments as in ``joint_tour``."""
     n, _, most = options.shape

@@ -9,15 +9,15 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from netdesign.model.arrays import Bools
+from netdesign.model.compiled import FAST, entry
 
 LANES = 4  # options are counted in whole vectors: kernels run over the rest of the last one and ignore it
 _HALF_TURN = np.float32(math.pi)
 _NONE = np.float32(0.0)
-_FAST = {"reassoc", "contract", "arcp", "nsz", "nnan", "ninf"}
+_FINITE = FAST | {"nnan", "ninf"}
 
 
 class MapArrays(NamedTuple):
@@ -70,7 +70,7 @@ def map_arrays(
     return MapArrays(joints, state, blocks, turns, usable, half, -(-options // LANES) * LANES)
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
+@entry(fastmath=_FINITE)
 def options_of(arrays, directions, block, options, count):  # type: ignore[no-untyped-def]
     """Write the free options of unit directions (n, 3) into options (n, r, most), their numbers into count (n,).
 

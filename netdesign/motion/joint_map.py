@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.compiled import entry
 from netdesign.model.frames import look_at, sphere_directions
 from netdesign.model.scene import Part
 from netdesign.model.task import RobotCell, ViewingSphere
@@ -225,14 +225,14 @@ def solve_closed(arm: ArmCell, targets: Floats) -> tuple[Floats, Bools]:
     return solved, found
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def _closed(axes, points, wrist, flange_inverse, targets, solved, found):  # type: ignore[no-untyped-def]
     for node in range(targets.shape[0]):
         if targets[node, 3, 3] == 1.0:
             ur_branches(axes, points, wrist, flange_inverse, targets[node], solved[node], found[node])
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def _states_of(body, lower, upper, joints, found, rest):  # type: ignore[no-untyped-def]
     """Bring joints (N, r) into their limits in place and return their states (N,) int8.
 

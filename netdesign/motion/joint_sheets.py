@@ -8,9 +8,9 @@ a few values, each with its own sheets: a redundant arm has a continuum of solut
 import math
 
 import numpy as np
-from numba import njit
 
 from netdesign.model.arrays import Bools, Floats
+from netdesign.model.compiled import entry
 from netdesign.motion.kinematics import refine, restarts, solve_restarts
 from netdesign.motion.robot import Chain
 
@@ -86,7 +86,7 @@ def _near(chain: Chain, first: Floats, second: Floats) -> bool:
     return bool(np.abs(difference).max() < _SAME)
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def _flood(placements, last_from_flange, lower, upper, wraps, free, targets, wanted, anchor, start, joints, found):  # type: ignore[no-untyped-def]
     """Spread the solution ``start`` (r,) from node ``anchor`` (3,) over joints (R, G, G, r) and found (R, G, G)."""
     layers, size, r = joints.shape[0], joints.shape[1], joints.shape[3]

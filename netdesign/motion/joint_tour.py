@@ -19,9 +19,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from netdesign.model.arrays import Floats
+from netdesign.model.compiled import FAST, entry, part
 from netdesign.motion.cell import ArmCell
 from netdesign.motion.joint_lookup import LANES, options_of
 from netdesign.motion.tour import _improve
@@ -30,7 +30,7 @@ NO_TURN = 1e9
 _ROUNDS = 1  # more rounds shorten the tours by 0.3 % on average and cost half as much again
 _TINY = 1e-30
 MOST_JOINTS = 7
-_FAST = {"reassoc", "contract", "arcp", "nsz", "nnan"}
+_NO_NAN = FAST | {"nnan"}
 
 
 def law_of(arm: ArmCell) -> Floats:
@@ -45,14 +45,14 @@ def law_of(arm: ArmCell) -> Floats:
     return law
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
+@part(fastmath=_NO_NAN)
 def _apart(first, second, turn):  # type: ignore[no-untyped-def]
     """Return how far a joint has to turn."""
     d = abs(first - second)
     return min(d, abs(turn - d))
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
+@entry(fastmath=_NO_NAN)
 def legs_along(options, count, tour, law, timed, out):  # type: ignore[no-untyped-def]
     """Write the costs of all legs between the stations that follow each other on a tour into out (n, K, K).
 
@@ -110,7 +110,7 @@ class Work(NamedTuple):
     trial: Any
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def work_for(n, r, most):  # type: ignore[no-untyped-def]
     """Return scratch for n stations of at most ``most`` options of r joints."""
     wide = (max(n, most) + LANES - 1) // LANES * LANES
@@ -121,7 +121,7 @@ def work_for(n, r, most):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def choose_options(options, count, label, barred, tour, law, timed, choice, work):  # type: ignore[no-untyped-def]
     """Write the best option of every station into choice (n,) for the closed tour (n + 1,) with its dummy in front.
 
@@ -160,7 +160,7 @@ def choose_options(options, count, label, barred, tour, law, timed, choice, work
     return length
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _chosen_distances(options, label, barred, choice, law, timed, work):  # type: ignore[no-untyped-def]
     """Write the leg costs between the chosen options into work.distances, the dummy in front."""
     picked, legs, distances = work.picked, work.legs, work.distances
@@ -178,7 +178,7 @@ def _chosen_distances(options, label, barred, choice, law, timed, work):  # type
                 distances[i + 1, j + 1] += barred[i, j, label[i, choice[i]], label[j, choice[j]]]
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def joint_tour(options, count, label, barred, law, timed, tour, rounds, work):  # type: ignore[no-untyped-def]
     """Improve the closed tour (n + 1,) with its dummy in front, in place; return its length, the choice in work.choice.
 
@@ -202,7 +202,7 @@ def joint_tour(options, count, label, barred, law, timed, tour, rounds, work):  
     return best
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def directions_tour(directions):  # type: ignore[no-untyped-def]
     """Return the closed tour (n + 1,), dummy in front, that goes from unit direction (n, 3) to nearest direction."""
     n = directions.shape[0]
@@ -233,7 +233,7 @@ class SearchWork(NamedTuple):
     barred: Any
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def search_work_for(arrays, n):  # type: ignore[no-untyped-def]
     """Return scratch of ``network_tour`` for up to n viewpoints over a map: of its own, and the tour's."""
     r = arrays.joints.shape[4]
@@ -244,7 +244,7 @@ def search_work_for(arrays, n):  # type: ignore[no-untyped-def]
     return own, work_for(n, r, arrays.most)
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def network_tour(arrays, law, timed, dwell, viewpoints, own, work):  # type: ignore[no-untyped-def]
     """Return (f2, refused) of one network in the search: its joint tour from the map, and the stations out of reach.
 
@@ -263,6 +263,6 @@ def network_tour(arrays, law, timed, dwell, viewpoints, own, work):  # type: ign
     if kept > 1:
         tour = directions_tour(own.directions[:kept])
         length = joint_tour(
-            own.options[:kept], own.count[:kept], own.label, own.barred, law, timed, tour, _ROUNDS, work
+            own.options[:kept], own.count[:kept], own.label, own.barred, law, timed, tour, np.int64(_ROUNDS), work
         )
     return (length + dwell * n if timed else length), refused

@@ -11,9 +11,9 @@ limits and turned back afterwards: clamping it loses two solutions in three (mea
 import math
 
 import numpy as np
-from numba import njit
 
 from netdesign.model.arrays import Bools, Floats
+from netdesign.model.compiled import entry, part
 from netdesign.motion.robot import Chain
 
 _ARM = 0.3
@@ -23,7 +23,7 @@ _TOLERANCE = 1e-13
 _SLACK = 1e-9  # rad: a limit met up to rounding counts as met
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def link_poses(placements, q, out):  # type: ignore[no-untyped-def]
     """Write base_from_link (r, 3, 4) of every moving link into ``out``."""
     r = q.shape[0]
@@ -47,7 +47,7 @@ def link_poses(placements, q, out):  # type: ignore[no-untyped-def]
             pos[a] = new[a, 3]
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def flange_of(last_link, last_from_flange, out):  # type: ignore[no-untyped-def]
     """Write base_from_flange (3, 4) of the last link's pose (3, 4) into ``out``."""
     for a in range(3):
@@ -58,7 +58,7 @@ def flange_of(last_link, last_from_flange, out):  # type: ignore[no-untyped-def]
             out[a, b] = value
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def forward(placements, last_from_flange, joints):  # type: ignore[no-untyped-def]
     """Return base_from_flange (n, 4, 4) of joints (n, r)."""
     n, r = joints.shape
@@ -71,7 +71,7 @@ def forward(placements, last_from_flange, joints):  # type: ignore[no-untyped-de
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _pose_error(flange, target, error):  # type: ignore[no-untyped-def]
     """Write position error (m) and ``_ARM`` times the rotation vector, both in the base frame; return the norm."""
     e = np.empty((3, 3))
@@ -99,7 +99,7 @@ def _pose_error(flange, target, error):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _fill_jacobian(links, flange, free, jacobian):  # type: ignore[no-untyped-def]
     """Write the base-frame Jacobian (6, r), rotation rows times ``_ARM``; columns of joints held are zero."""
     for i in range(links.shape[0]):
@@ -112,7 +112,7 @@ def _fill_jacobian(links, flange, free, jacobian):  # type: ignore[no-untyped-de
         jacobian[3, i], jacobian[4, i], jacobian[5, i] = on * _ARM * zx, on * _ARM * zy, on * _ARM * zz
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _solve_damped(jacobian, error, damping, step):  # type: ignore[no-untyped-def]
     """Write J^T (J J^T + damping I)^-1 e into ``step`` by Cholesky of the 6 x 6 matrix."""
     r = jacobian.shape[1]
@@ -145,7 +145,7 @@ def _solve_damped(jacobian, error, damping, step):  # type: ignore[no-untyped-de
         step[k] = value
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def into_limits(q, lower, upper):  # type: ignore[no-untyped-def]
     """Turn every joint of q (r,) by whole turns to the value inside its limits nearest zero, in place.
 
@@ -164,7 +164,7 @@ def into_limits(q, lower, upper):  # type: ignore[no-untyped-def]
     return inside
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def refine(placements, last_from_flange, lower, upper, wraps, free, target, q):  # type: ignore[no-untyped-def]
     """Move q (r,) in place to the pose target (4, 4) = base_from_flange; return whether it got there within limits.
 
@@ -204,7 +204,7 @@ def refine(placements, last_from_flange, lower, upper, wraps, free, target, q): 
     return cost < 1e-20 and into_limits(q, lower, upper)
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def solve_restarts(placements, last_from_flange, lower, upper, wraps, free, target, q, starts):  # type: ignore[no-untyped-def]
     """Like ``refine`` from q, then from each of starts (s, r) until one succeeds; joints held keep q's value."""
     held = q.copy()

@@ -9,17 +9,17 @@ P[x, y] = D[t[x], t[y]] the distances in tour order.
 """
 
 import numpy as np
-from numba import njit
 
 from netdesign.errors import InputError
 from netdesign.model.arrays import Floats, Ints
+from netdesign.model.compiled import FAST, entry, part
 
 EXACT_UP_TO = 12
 KICKS = 1000
 _GAIN = 1e-12  # relative: a move must gain more than rounding
 
 
-@njit(cache=True)
+@part()
 def _with_dummy(distance: Floats) -> Floats:
     """Return D (n+1, n+1): ``distance`` with the dummy node in front."""
     n = len(distance)
@@ -30,7 +30,7 @@ def _with_dummy(distance: Floats) -> Floats:
     return padded
 
 
-@njit(cache=True)
+@part()
 def _without_dummy(t: Ints) -> Ints:
     """Return the order (n,) of the closed tour ``t`` without its dummy."""
     order = np.empty(len(t) - 1, np.int64)
@@ -39,7 +39,7 @@ def _without_dummy(t: Ints) -> Ints:
     return order
 
 
-@njit(cache=True)
+@part()
 def _nearest_neighbour(D: Floats, first: int) -> Ints:
     """Return the closed tour that starts dummy, ``first`` and always goes on to the nearest node left."""
     N = len(D)
@@ -55,7 +55,7 @@ def _nearest_neighbour(D: Floats, first: int) -> Ints:
     return t
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _length(D: Floats, t: Ints) -> float:
     total = 0.0
     for x in range(1, len(t) - 1):
@@ -63,7 +63,7 @@ def _length(D: Floats, t: Ints) -> float:
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _two_opt(D: Floats, t: Ints, threshold: float) -> None:
     """Reverse segments of ``t`` in place until no reversal gains more than ``threshold``."""
     N = len(t)
@@ -83,7 +83,7 @@ def _two_opt(D: Floats, t: Ints, threshold: float) -> None:
                     improved = True
 
 
-@njit(cache=True, error_model="numpy", fastmath={"nnan", "nsz", "reassoc", "contract"})
+@part(fastmath=FAST | {"nnan"})
 def _three_opt_move(D: Floats, t: Ints, P: Floats, threshold: float) -> bool:
     """Apply one pure 3-opt move that gains more than ``threshold``; False when ``t`` is 3-optimal.
 
@@ -120,7 +120,7 @@ def _three_opt_move(D: Floats, t: Ints, P: Floats, threshold: float) -> bool:
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _reconnect(t: Ints, P: Floats, i: int, j: int) -> None:
     """Apply to ``t`` the best of the reconnections of :func:`_three_opt_move` for (i, j)."""
     N = len(t)
@@ -151,7 +151,7 @@ def _reconnect(t: Ints, P: Floats, i: int, j: int) -> None:
         t[i + 1 + x] = old[source]
 
 
-@njit(cache=True)
+@part()
 def _improve(D: Floats, t: Ints, P: Floats) -> float:
     """Make ``t`` 2-optimal and 3-optimal in place; return its open length."""
     threshold = _GAIN * (_length(D, t) + 1e-300)
@@ -162,7 +162,7 @@ def _improve(D: Floats, t: Ints, P: Floats) -> float:
     return length
 
 
-@njit(cache=True)
+@entry()
 def nearest_neighbour_3opt(distance: Floats) -> tuple[Ints, float]:
     """Return (order (n,), length) of the source paper's heuristic: nearest neighbour from node 0, then full 3-opt.
 
@@ -175,7 +175,7 @@ def nearest_neighbour_3opt(distance: Floats) -> tuple[Ints, float]:
     return _without_dummy(t), length
 
 
-@njit(cache=True)
+@entry()
 def path_length(positions: Floats) -> float:
     """Return the length of the heuristic path over positions (n, d), Euclidean distances."""
     n, axes = positions.shape
@@ -192,7 +192,7 @@ def path_length(positions: Floats) -> float:
     return length
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def held_karp(distance: Floats) -> tuple[Ints, float]:
     """Return (order (n,), length) of the shortest open path, exact, by dynamic programming over subsets.
 
@@ -200,7 +200,10 @@ def held_karp(distance: Floats) -> tuple[Ints, float]:
     """
     n = len(distance)
     full = (1 << n) - 1
-    shortest = np.full((1 << n, n), np.inf)
+    shortest = np.empty((1 << n, n))  # loops: np.full and argmin take numba long to compile
+    for subset in range(1 << n):
+        for last in range(n):
+            shortest[subset, last] = np.inf
     for last in range(n):
         shortest[1 << last, last] = 0.0
     for subset in range(1, 1 << n):
@@ -214,7 +217,10 @@ def held_karp(distance: Floats) -> tuple[Ints, float]:
                     if longer < shortest[subset | 1 << following, following]:
                         shortest[subset | 1 << following, following] = longer
     order = np.zeros(n, np.int64)
-    last = int(np.argmin(shortest[full]))
+    last = 0
+    for candidate in range(n):
+        if shortest[full, candidate] < shortest[full, last]:
+            last = candidate
     length = shortest[full, last]
     subset = full
     for position in range(n - 1, -1, -1):
@@ -228,7 +234,7 @@ def held_karp(distance: Floats) -> tuple[Ints, float]:
     return order, length
 
 
-@njit(cache=True)
+@entry()
 def iterated_local_search(distance: Floats, cuts: Ints) -> tuple[Ints, float]:
     """Return (order (n,), length): the best 3-optimal path from every start, then one double bridge per ``cuts`` row.
 

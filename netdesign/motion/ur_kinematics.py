@@ -16,9 +16,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from netdesign.model.arrays import Floats, frozen
+from netdesign.model.compiled import part
 from netdesign.model.frames import inverse
 from netdesign.motion.kinematics import base_from_flange
 from netdesign.motion.robot import Chain
@@ -73,28 +73,28 @@ def ur_arm(chain: Chain, tolerance: float = 1e-9) -> UrArm | None:
 # Vectors are tuples of three here: numba compiles them in a fraction of the time it takes for array expressions.
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _row(array, index):  # type: ignore[no-untyped-def]
     return array[index, 0], array[index, 1], array[index, 2]
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _dot(a, b):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _cross(a, b):  # type: ignore[no-untyped-def]
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _sum(a, scale, b):  # type: ignore[no-untyped-def]
     """Return a + scale b."""
     return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _turn(axis, angle, v):  # type: ignore[no-untyped-def]
     """Return v turned about a unit axis (Rodrigues)."""
     c, s = math.cos(angle), math.sin(angle)
@@ -107,13 +107,13 @@ def _turn(axis, angle, v):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _angle_about(axis, start, end):  # type: ignore[no-untyped-def]
     """Return the angle about a unit axis that takes the part of ``start`` normal to it to that of ``end``."""
     return math.atan2(_dot(axis, _cross(start, end)), _dot(start, end) - _dot(axis, start) * _dot(axis, end))
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _rotated(g, v):  # type: ignore[no-untyped-def]
     return (
         g[0, 0] * v[0] + g[0, 1] * v[1] + g[0, 2] * v[2],
@@ -122,7 +122,7 @@ def _rotated(g, v):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _rotated_back(g, v):  # type: ignore[no-untyped-def]
     return (
         g[0, 0] * v[0] + g[1, 0] * v[1] + g[2, 0] * v[2],
@@ -131,7 +131,7 @@ def _rotated_back(g, v):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _two_angles(a, b, c):  # type: ignore[no-untyped-def]
     """Return (middle, half) of the two solutions middle ± half of a cos x + b sin x = c; half < 0 when none.
 
@@ -143,7 +143,7 @@ def _two_angles(a, b, c):  # type: ignore[no-untyped-def]
     return math.atan2(b, a), math.acos(min(max(c / length, -1.0), 1.0))
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def ur_branches(axes, points, wrist, flange_inverse, target, q, found):  # type: ignore[no-untyped-def]
     """Write the joints of every branch into q (8, 6), each in (-pi, pi], and whether it exists into found (8,).
 

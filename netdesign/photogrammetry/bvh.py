@@ -7,10 +7,10 @@ depth-first order, which the bits of the index give.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.compiled import entry, part
 
 LEAF_SIZE = 4
 # Barycentric slack: a ray through the edge that two triangles share must hit one of them.
@@ -76,7 +76,7 @@ def _starts(count: int, level: int) -> Ints:
     return np.arange(parts + 1, dtype=np.int64) * count // parts
 
 
-@numba.njit(cache=True, error_model="numpy")
+@part()
 def blocking_triangle(
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, bounds: Floats, starts: Ints, triangles: Floats
 ) -> int:
@@ -128,7 +128,7 @@ def blocking_triangle(
     return -1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@entry()
 def _all_segments(origins: Floats, ends: Floats, bounds: Floats, starts: Ints, triangles: Floats) -> Bools:
     result = np.zeros(len(origins), np.bool_)
     for k in range(len(origins)):

@@ -1,14 +1,14 @@
 """The camera side of the total trace, compiled: the datum's rows of the poses, and inverses by Cholesky factors."""
 
 import numpy as np
-from numba import njit
 
 from netdesign.model.arrays import Floats
+from netdesign.model.compiled import FAST, entry
 
 PIVOT = 1e-12  # of the scaled normal matrix with unit diagonal: below it the network is not determined
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def datum_rows(world_from_cam: Floats, points: Floats) -> Floats:
     """Return the camera rows (6n, 7) of the datum's null space about the points' centroid."""
     images, count = world_from_cam.shape[0], points.shape[0]
@@ -38,7 +38,7 @@ def datum_rows(world_from_cam: Floats, points: Floats) -> Floats:
     return gauge
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def orthonormalise(gauge: Floats, scale: Floats) -> bool:
     """Divide the rows by ``scale`` and make the columns orthonormal in place (Gram-Schmidt, twice)."""
     width = gauge.shape[0]
@@ -62,7 +62,7 @@ def orthonormalise(gauge: Floats, scale: Floats) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
+@entry(fastmath=FAST)
 def invert(matrix: Floats) -> bool:
     """Replace the lower triangle of a positive definite matrix by that of its inverse; False if a pivot vanishes."""
     width = matrix.shape[0]
@@ -94,7 +94,7 @@ def invert(matrix: Floats) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def image_by_image(schur: Floats, spread: Floats) -> float:
     """Return Σ_i tr(S_ii⁻¹ (BᵀB)_ii) from the lower triangles of S and BᵀB; inf when an image is not determined."""
     value = 0.0

@@ -7,9 +7,9 @@ would fill a gigabyte as a full (3m, W) matrix; stored by point they fill some t
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from netdesign.model.arrays import Floats, Ints
+from netdesign.model.compiled import entry
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ class Coupling:
         return Coupling(start=start, column=column[order], value=value[order], width=self.width)
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def _spread(
     start: Ints, column: Ints, value: Floats, covariance: Floats, other: Floats
 ) -> tuple[Floats, Floats]:  # pragma: no cover - compiled

@@ -18,9 +18,9 @@ Every image that sees a point adds its observation equations to the point's own 
 """
 
 import numpy as np
-from numba import njit
 
 from netdesign.model.arrays import Bools, Floats
+from netdesign.model.compiled import FAST, entry, part
 from netdesign.photogrammetry.collinearity import project_with_jacobians
 
 SINGULAR = 1e-13
@@ -28,8 +28,6 @@ SINGULAR = 1e-13
 
 WEAK = 1e-6
 """det N / (tr N)³ below which the search refuses a point: two rays that meet at less than about 0.4 degrees."""
-
-_FAST = {"contract", "reassoc", "arcp", "nsz"}  # never nnan or ninf: infinite sigmas must stay visible
 
 
 def limited_covariance(
@@ -63,7 +61,7 @@ def conditioning(normal: Floats) -> Floats:
     return np.where(trace > 0, np.linalg.det(scaled), 0.0)
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
+@entry(fastmath=FAST)
 def direct_covariance(
     world_from_cam: Floats, points: Floats, intrinsics: Floats, visible: Bools, sigma_px: Floats
 ) -> Floats:
@@ -128,7 +126,7 @@ def blocked(rows: Floats) -> Floats:
     return np.ascontiguousarray(padded.reshape(len(rows), count, LANES).transpose(1, 0, 2)).ravel()
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
+@part(fastmath=FAST)
 def add_four_cameras(moments: Floats, points: Floats, directions: Floats, weights: Floats, radius: float) -> None:
     """Add four cameras to the moments of all points: one pass over memory, weights instead of branches.
 
@@ -168,7 +166,7 @@ def add_four_cameras(moments: Floats, points: Floats, directions: Floats, weight
             moments[s + np.uint64(8 * LANES)] += a_z + b_z + c_z + d_z
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
+@part(fastmath=FAST)
 def variances_from_moments(moments: Floats, points: Floats, radius: float, count: int, variances: Floats) -> int:
     """Write the variances along x, y, z and return how many points are WEAK (their variances mean nothing).
 

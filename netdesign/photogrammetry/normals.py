@@ -16,9 +16,9 @@ Sources: D. C. Brown, The Bundle Adjustment, ISP 1976; B. Triggs et al., Bundle 
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.compiled import entry
 from netdesign.photogrammetry.coupling import Coupling
 
 
@@ -123,7 +123,7 @@ def _inverse3(npp: Floats, eliminated: Bools) -> tuple[Floats, Floats]:
     return inverse, condition
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def _add_points(
     point: Ints, point_part: Floats, residual: Floats, npp: Floats, rhs: Floats
 ) -> None:  # pragma: no cover - compiled
@@ -137,7 +137,7 @@ def _add_points(
                     npp[p, i, j] += point_part[k, row, i] * point_part[k, row, j]
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def _eliminate(
     start: Ints,
     eliminated: Bools,

@@ -9,10 +9,10 @@ The cone has its apex at an object point and contains all the camera positions i
   starts on the axis cannot leave the patch without leaving the cone.
 """
 
-import numba
 import numpy as np
 
 from netdesign.model.arrays import Floats, Ints
+from netdesign.model.compiled import part
 from netdesign.photogrammetry.bvh import TriangleTree
 
 # Added to the sine of the half angle: more than the exact test's barycentric slack and rounding.
@@ -43,7 +43,7 @@ def neighbours(tree: TriangleTree) -> Ints:
     return np.ascontiguousarray(np.where(found, order[place] // 3, -1).reshape(count, 3))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@part()
 def cone_is_free(
     px: float, py: float, pz: float, axis: Floats, distance: float, spread: float, normal: Floats, clearance: float,
     bounds: Floats, starts: Ints, triangles: Floats,
@@ -94,7 +94,7 @@ def cone_is_free(
     return True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@part()
 def cone_is_covered(
     first: int, px: float, py: float, pz: float, axis: Floats, distance: float, spread: float, normal: Floats,
     clearance: float, least_cosine: float, triangles: Floats, across: Ints, visited: Ints, queue: Ints,
@@ -139,7 +139,7 @@ def cone_is_covered(
     return True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@part()
 def _seen_from(
     triangle: Floats, px: float, py: float, pz: float, nx: float, ny: float, nz: float
 ) -> tuple[Corners, float, float]:
@@ -155,7 +155,7 @@ def _seen_from(
     return ((ax, ay, az), (bx, by, bz), (cx, cy, cz)), highest, farthest
 
 
-@numba.njit(cache=True, error_model="numpy")
+@part()
 def _plane_distance(triangle: Floats, corners: Corners) -> float:
     """Signed distance of the triangle's plane from the apex; 0 for a degenerate triangle."""
     ax, ay, az = triangle[3], triangle[4], triangle[5]
@@ -167,7 +167,7 @@ def _plane_distance(triangle: Floats, corners: Corners) -> float:
     return float((corners[0][0] * mx + corners[0][1] * my + corners[0][2] * mz) / area)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@part()
 def _meets(corners: Corners, dx: float, dy: float, dz: float, sine: float, cosine: float) -> bool:
     """Tell whether the triangle meets the infinite cone: the axis hits it, or an edge comes near enough."""
     inside = True
@@ -182,7 +182,7 @@ def _meets(corners: Corners, dx: float, dy: float, dz: float, sine: float, cosin
     return inside
 
 
-@numba.njit(cache=True, error_model="numpy")
+@part()
 def _edge_meets(corners: Corners, k: int, dx: float, dy: float, dz: float, sine: float, cosine: float) -> bool:
     """Tell whether edge k comes within the cone: angular distance of the axis from an arc of directions."""
     ax, ay, az = corners[k]

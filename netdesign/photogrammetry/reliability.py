@@ -14,9 +14,9 @@ Sources: W. Baarda, A testing procedure for use in geodetic networks, 1968; W. F
 """
 
 import numpy as np
-from numba import njit
 
 from netdesign.model.arrays import Floats, Ints
+from netdesign.model.compiled import entry
 from netdesign.photogrammetry.normals import Linearised, Reduced
 
 DELTA0 = 4.13
@@ -39,7 +39,7 @@ def redundancy_matrices(linearised: Linearised, reduced: Reduced, camera_inverse
     )
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def _redundancy(
     columns: Ints,
     camera: Floats,

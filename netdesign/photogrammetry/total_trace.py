@@ -14,13 +14,13 @@ at the cost of a few limited propagations: it sees an image that hangs loose, bu
 """
 
 import numpy as np
-from numba import njit
 
 from netdesign.model.arrays import Bools, Floats
+from netdesign.model.compiled import FAST, entry, part
 from netdesign.photogrammetry.camera_side import datum_rows, image_by_image, invert, orthonormalise
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def total_trace(
     world_from_cam: Floats, points: Floats, intrinsics: Floats, visible: Bools, sigma_px: Floats, basis: Floats
 ) -> float:
@@ -34,13 +34,13 @@ def total_trace(
     return float(propagated(world_from_cam, points, intrinsics, visible, sigma_px, basis, False)[0])
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def block_trace(world_from_cam: Floats, points: Floats, intrinsics: Floats, visible: Bools, sigma_px: Floats) -> float:
     """Return the block-diagonal middle between limited and total trace (m²); arguments as of :func:`total_trace`."""
     return float(propagated(world_from_cam, points, intrinsics, visible, sigma_px, np.zeros((0, 7)), True)[0])
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
+@entry(fastmath=FAST)
 def propagated(
     world_from_cam: Floats, points: Floats, intrinsics: Floats, visible: Bools, sigma_px: Floats, basis: Floats,
     blocks: bool,
@@ -176,7 +176,7 @@ def propagated(
     return result
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _derivatives(
     world_from_cam: Floats, x: Floats, intrinsics: Floats, weight: float, pose: Floats, point: Floats
 ) -> bool:

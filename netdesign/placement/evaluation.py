@@ -8,10 +8,10 @@ follows the first failing stage. What is reported is computed anew, exactly, in 
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.compiled import FAST, entry, part
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.motion.joint_tour import network_tour, search_work_for
 from netdesign.motion.tour import path_length
@@ -19,6 +19,9 @@ from netdesign.photogrammetry.limited_error import LANES, add_four_cameras, vari
 from netdesign.placement.visibility_map import cell_index
 
 MEAN_VARIANCE, MAX_SIGMA = 0, 1
+
+FOUR_TAGS = np.repeat((np.arange(16)[:, None] >> np.arange(4)) & 1, CORNERS_PER_TAG, axis=1).ravel().astype(np.float64)
+"""What four bits become: 1 for every corner of a tag that is seen, (16 x LANES,)."""
 
 
 class SphereTables(NamedTuple):
@@ -67,7 +70,7 @@ class JointTables(NamedTuple):
     longest: float
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def popcount(word: np.uint64) -> int:
     """Return the number of bits set in 64 bits (SWAR; H. S. Warren, Hacker's Delight, chapter 5)."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
@@ -76,7 +79,7 @@ def popcount(word: np.uint64) -> int:
     return int((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def missing_sightings(cells: Ints, tables: SphereTables, at_least: NDArray[np.uint64]) -> float:
     """Return the rays that tags lack plus the shares of tags that images lack, for images in ``cells`` (k,).
 
@@ -103,33 +106,37 @@ def missing_sightings(cells: Ints, tables: SphereTables, at_least: NDArray[np.ui
     return lacking
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def write_direction(alpha: float, beta: float, direction: Floats) -> None:
     """Write the unit vector (3,) of a viewpoint."""
     flat = np.cos(beta)
     direction[0], direction[1], direction[2] = flat * np.cos(alpha), flat * np.sin(alpha), np.sin(beta)
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def write_weights(
     alpha: float, beta: float, cell: int, sign: float, slot: int, tables: SphereTables, weights: Floats
 ) -> None:
     """Write into ``slot`` of blocks of 4 rows what each point's sighting from a viewpoint weighs, times ``sign``."""
-    row = np.uint64(0 if len(tables.weight) == 1 else cell_index(alpha, beta, tables.weight_grid))
+    constant = len(tables.weight) == 1
+    row = np.uint64(0 if constant else cell_index(alpha, beta, tables.weight_grid))
     for block in range(tables.weight.shape[1] // LANES):
         tag = np.uint64(4 * block)
         four_tags = (tables.sure[cell, tag >> np.uint64(6)] >> (tag & np.uint64(63))) & np.uint64(15)
-        start, first = np.uint64((4 * block + slot) * LANES), np.uint64(block * LANES)
-        for corner in range(0, LANES, CORNERS_PER_TAG):
-            seen = sign if (four_tags >> np.uint64(corner // CORNERS_PER_TAG)) & np.uint64(1) else 0.0
-            to, of = start + np.uint64(corner), first + np.uint64(corner)
-            weights[to] = seen * tables.weight[row, of]
-            weights[to + np.uint64(1)] = seen * tables.weight[row, of + np.uint64(1)]
-            weights[to + np.uint64(2)] = seen * tables.weight[row, of + np.uint64(2)]
-            weights[to + np.uint64(3)] = seen * tables.weight[row, of + np.uint64(3)]
+        start, first = np.uint64((4 * block + slot) * LANES), four_tags * np.uint64(LANES)
+        if sign != 1.0:
+            for lane in range(LANES):
+                weights[start + np.uint64(lane)] = sign * FOUR_TAGS[first + np.uint64(lane)]
+        else:
+            for lane in range(LANES):
+                weights[start + np.uint64(lane)] = FOUR_TAGS[first + np.uint64(lane)]
+        if not constant:
+            first = np.uint64(block * LANES)
+            for lane in range(LANES):
+                weights[start + np.uint64(lane)] *= tables.weight[row, first + np.uint64(lane)]
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def write_moments(
     viewpoints: Floats, directions: Floats, cells: Ints, tables: SphereTables, weights: Floats, four: Floats,
     moments: Floats,
@@ -147,7 +154,7 @@ def write_moments(
         add_four_cameras(moments, tables.points, four, weights, tables.radius)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
+@part(fastmath=FAST)
 def precision_objective(variances: Floats, tables: SphereTables) -> float:
     """Return f1 from the variances: their mean in m², or the square root of the largest in m."""
     if tables.criterion == MAX_SIGMA:
@@ -161,13 +168,13 @@ def precision_objective(variances: Floats, tables: SphereTables) -> float:
     return total * tables.variance / (3 * tables.point_count)
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def excess(length: float, longest: float) -> float:
     """Return how far a tour is beyond the longest admissible one, in [0, 1)."""
     return max(0.0, 1.0 - longest / length) if length > 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@entry(nogil=True)
 def joint_tours(bits: Bools, genes: Floats, joint: JointTables, objectives: Floats, violation: Floats) -> None:
     """Replace f2 of the feasible rows by the joint-space tour and add the stations out of reach to their violation.
 
@@ -189,7 +196,7 @@ def joint_tours(bits: Bools, genes: Floats, joint: JointTables, objectives: Floa
         violation[p] = refused + excess(length, joint.longest)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@entry(nogil=True)
 def evaluate_networks(bits: Bools, genes: Floats, tables: SphereTables, objectives: Floats, violation: Floats) -> None:
     """Write objectives (P, 3) and violation (P,) of chromosomes: bits (P, n), genes (P, n, 2) = (alpha, beta) rad.
 

@@ -17,15 +17,15 @@ so a cell whose viewpoints lie within delta of its middle admits at most value +
 delta² / 2, gradients added over the points before the norm is taken. gain and sigma enter by their best in the cell.
 """
 
-import numba
 import numpy as np
 
 from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.compiled import entry, part
 from netdesign.model.frames import sphere_directions
 from netdesign.placement.visibility_cells import Words
 
 
-@numba.njit(cache=True, error_model="numpy")
+@part()
 def weight(
     z: float, lateral: float, w: float, cosine: float, distance: float, radius: float, delta: float, gains: Floats,
     sigmas: Floats,
@@ -90,7 +90,7 @@ def normal_matrices(
     return matrices
 
 
-@numba.njit(cache=True, error_model="numpy")
+@entry()
 def largest_gains(
     cells: Ints, grid: Floats, parts: int, spreads: Floats, bits: Words, radius: float, points: Floats, normals: Floats,
     forms: Floats, gains: Floats, sigmas: Floats,
@@ -108,11 +108,11 @@ def largest_gains(
     columns = int(grid[2])
     for index in range(len(cells)):
         cell = cells[index]
-        for part in range(parts * parts):
-            alpha = grid[0] + (cell % columns + (part % parts + 0.5) / parts) / grid[1]
-            beta = grid[3] + (cell // columns + (part // parts + 0.5) / parts) / grid[4]
+        for piece in range(parts * parts):
+            alpha = grid[0] + (cell % columns + (piece % parts + 0.5) / parts) / grid[1]
+            beta = grid[3] + (cell // columns + (piece // parts + 0.5) / parts) / grid[4]
             ux, uy, uz = np.cos(beta) * np.cos(alpha), np.cos(beta) * np.sin(alpha), np.sin(beta)
-            delta = spreads[cell // columns, part // parts]
+            delta = spreads[cell // columns, piece // parts]
             value = curvature = gx = gy = gz = 0.0
             for tag in range(len(points) // 4):
                 if not (bits[cell, tag >> 6] >> np.uint64(tag & 63)) & np.uint64(1):

@@ -11,9 +11,9 @@ With motion in joints the workspace tour only guides the moves; f2 of what was t
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from netdesign.model.arrays import Floats, Ints
+from netdesign.model.compiled import entry, part
 from netdesign.motion.tour import _improve
 from netdesign.photogrammetry.limited_error import LANES, add_four_cameras, variances_from_moments
 from netdesign.placement.evaluation import (
@@ -49,7 +49,7 @@ class Tries(NamedTuple):
     preference: Floats
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def write_step(viewpoint: Floats, direction: Floats, step: Floats, limits: Floats, moved: Floats) -> None:
     """Write the viewpoint (2,) after a step (bearing, length) along the sphere, folded into ``limits`` (4,)."""
     east_x, east_y = -np.sin(viewpoint[0]), np.cos(viewpoint[0])
@@ -64,7 +64,7 @@ def write_step(viewpoint: Floats, direction: Floats, step: Floats, limits: Float
     moved[1] = min(max(np.arctan2(z, np.sqrt(x * x + y * y)), limits[2]), limits[3])
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def write_chords(directions: Floats, k: int, a: int, D: Floats) -> None:
     """Write the chords from station ``a`` to the ``k`` stations with unit directions; station i is node i + 1."""
     for b in range(k):
@@ -74,7 +74,7 @@ def write_chords(directions: Floats, k: int, a: int, D: Floats) -> None:
         D[a + 1, b + 1] = D[b + 1, a + 1] = np.sqrt(square)
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def reinserted(D: Floats, t: Ints, count: int, gone: int, new: int, moved: Floats, out: Ints) -> float:
     """Write the closed tour t (count,) without node ``gone``, and with ``new`` where it costs least; return its length.
 
@@ -100,7 +100,7 @@ def reinserted(D: Floats, t: Ints, count: int, gone: int, new: int, moved: Float
     return length + best
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@entry(nogil=True)
 def improve_networks(
     viewpoints: Floats, sizes: Ints, tries: Tries, tables: SphereTables,
     found: Floats, counts: Ints, objectives: Floats, violation: Floats,

@@ -14,11 +14,11 @@ from the sphere's centre and R the radius:
   the derivatives of its two ends, subtracted before they are bounded.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.compiled import entry, part
 from netdesign.photogrammetry.bvh import blocking_triangle
 from netdesign.photogrammetry.occlusion import cone_is_covered, cone_is_free
 
@@ -29,7 +29,7 @@ Words = NDArray[np.uint64]
 Mesh = tuple[Floats, Ints, Floats, Ints, Ints, Ints]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@part()
 def classify(
     pose: Floats, radius: float, delta: float, turn: float, points: Floats, away: Floats, normal: Floats,
     settings: Floats, field: Floats, tag_size: float,
@@ -127,7 +127,7 @@ def classify(
     return VISIBLE if everywhere else UNDECIDED
 
 
-@numba.njit(cache=True, error_model="numpy")
+@part()
 def shadow(
     state: int, pose: Floats, spread: float, points: Floats, normal: Floats, settings: Floats, mesh: Mesh
 ) -> int:  # fmt: skip
@@ -163,7 +163,7 @@ def shadow(
     return state
 
 
-@numba.njit(cache=True, error_model="numpy")
+@entry()
 def fill(
     level: Ints, shape: Ints, poses: Floats, angles: Floats, radius: float, points: Floats, away: Floats,
     normals: Floats, shadowed: Bools, settings: Floats, field: Floats, tag_size: float, mesh: Mesh | None,

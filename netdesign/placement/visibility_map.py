@@ -12,11 +12,11 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
-import numba
 import numpy as np
 
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.camera import Camera
+from netdesign.model.compiled import part
 from netdesign.model.scene import Scene
 from netdesign.model.task import ViewingSphere, VisibilityLimits
 from netdesign.photogrammetry.bvh import TriangleTree
@@ -118,7 +118,7 @@ class VisibilityMap:
         return _unpack(self.sure[cells] | self.maybe[cells], self.tag_count)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@part()
 def cell_index(alpha: float, beta: float, grid: Floats) -> int:
     """Return the cell of a viewpoint; the azimuth wraps, what lies outside goes to the nearest row or column."""
     turn = 2.0 * np.pi

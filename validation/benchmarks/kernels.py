@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 from python_tsp.heuristics import solve_tsp_local_search
 
+from netdesign.model.compiled import entry
 from netdesign.model.frames import look_at, sphere_directions
 from netdesign.motion.tour import nearest_neighbour_3opt, open_path
 from netdesign.photogrammetry.limited_error import blocked
@@ -26,7 +26,7 @@ CELLS = 5000  # rows of visibility bits to draw from
 TEXTBOOK = 10  # networks of the slow side
 
 
-@njit(error_model="numpy")
+@entry()
 def _ours(viewpoints, cells, tables, out):
     blocks = len(tables.points) // 48
     directions, four = np.zeros((viewpoints.shape[1], 3)), np.zeros((4, 3))

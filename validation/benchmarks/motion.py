@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numba import njit
 
+from netdesign.model.compiled import entry
 from netdesign.motion.exact_tour import exact_joint_tour
 from netdesign.motion.joint_tour import law_of, network_tour, search_work_for
 from netdesign.motion.tour import path_length
@@ -19,6 +20,8 @@ from tests.cells import joint_map, reachable_viewpoints
 NETWORKS, STATIONS = 1000, 10
 EXACT, EXACT_STATIONS = 100, 8
 CASES = [("side", 0.0), ("coaxial", 0.0), ("side", None), ("coaxial", None)]
+
+TOUR = entry()(network_tour)
 
 
 @njit(error_model="numpy")
@@ -68,6 +71,6 @@ def _above(of_map, law) -> float:
         drawn = reachable_viewpoints(of_map, EXACT_STATIONS, seed)
         options, count = of_map.options(drawn)
         *_, best = exact_joint_tour(options, count, *nothing, law, False)
-        found, _ = network_tour(of_map.arrays, law, False, 0.0, drawn, *search_work_for(of_map.arrays, len(drawn)))
+        found, _ = TOUR(of_map.arrays, law, False, 0.0, drawn, *search_work_for(of_map.arrays, len(drawn)))
         ratios.append(found / best)
     return float(np.mean(ratios)) - 1.0

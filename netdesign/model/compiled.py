@@ -10,6 +10,7 @@ and the constants it reads, so that an edit anywhere in a kernel is never answer
 
 import hashlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from types import CodeType, SimpleNamespace
 from typing import Any
@@ -39,7 +40,7 @@ def entry(*, fastmath: frozenset[str] | bool = False, nogil: bool = False) -> Ca
         _sources[kernel] = _dependencies(function)
         index: Any = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
         if hasattr(index, "_source_stamp"):
-            index._source_stamp = _digest(_sources[kernel])
+            index._source_stamp = "\n".join(sorted(_sources[kernel]))
         return kernel
 
     return decorate
@@ -61,8 +62,8 @@ def _flags(fastmath: frozenset[str] | bool) -> set[str] | bool:
 
 
 def _dependencies(function: Function) -> frozenset[str]:
-    """Names of the files of a kernel and of all it calls, values of the constants it reads."""
-    found = {function.__code__.co_filename}
+    """The files of a kernel and of all it calls, the constants it reads."""
+    found = {_contents(function.__code__.co_filename)}
     for name in _names(function.__code__):
         value = function.__globals__.get(name)
         if isinstance(value, int | float | str | tuple | frozenset | np.ndarray):
@@ -78,13 +79,13 @@ def _names(code: CodeType) -> set[str]:
     return set(code.co_names).union(*map(_names, inner))
 
 
-def _digest(sources: frozenset[str]) -> str:
-    """The key of a kernel's sources: contents, not dates."""
-    digest = hashlib.sha256()
-    for source in sorted(sources):
-        path = Path(source)
-        digest.update(path.name.encode() + (path.read_bytes() if path.is_file() else source.encode()))
-    return digest.hexdigest()
+@cache
+def _contents(path: str) -> str:
+    """A source file by what is in it, not by its date."""
+    try:
+        return f"{Path(path).name} {hashlib.sha256(Path(path).read_bytes()).hexdigest()}"
+    except OSError:  # typed into an interpreter: numba does not keep it either
+        return path
 
 
 class _EntryLibrary(JITCodeLibrary):

@@ -1,0 +1,73 @@
+"""The cache of compiled kernels: an edit of a part, of its file or of a constant, reaches every entry that uses it."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from netdesign.model.compiled import entry, part
+from netdesign.placement.evaluation import excess, popcount
+
+ROOT = Path(__file__).parents[1]
+
+INNER = """
+from netdesign.model.compiled import part
+
+OFFSET = {offset}
+
+@part()
+def shifted(x):
+    return {factor} * x
+"""
+
+OUTER = """
+from inner import OFFSET, shifted
+from netdesign.model.compiled import entry
+
+@entry()
+def outer(x):
+    return shifted(x) + OFFSET
+
+print(outer(1.0), sum(outer.stats.cache_hits.values()))
+"""
+
+
+def test_an_edit_of_a_part_is_noticed(tmp_path):
+    (tmp_path / "outer.py").write_text(OUTER, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    said = []
+    for offset, factor in ((0.5, 2.0), (0.5, 2.0), (0.5, 3.0), (0.25, 3.0)):
+        (tmp_path / "inner.py").write_text(INNER.format(offset=offset, factor=factor), encoding="utf-8")
+        answer = subprocess.run(
+            [sys.executable, "-B", "outer.py"],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        said.append(answer.stdout.split())
+    assert said == [["2.5", "0"], ["2.5", "1"], ["3.5", "0"], ["3.25", "0"]]
+
+
+def test_a_part_is_the_same_function_from_python_and_compiled():
+    @part()
+    def squared(x):
+        return x * x
+
+    @entry()
+    def total(values):
+        result = 0.0
+        for value in values:
+            result += squared(value)
+        return result
+
+    values = np.random.default_rng(0).random(20)
+    assert squared(1.5) == 2.25
+    np.testing.assert_allclose(total(values), (values**2).sum(), rtol=1e-14)
+    bits = entry()(popcount)
+    for word in (0, 1, 2**63, 2**64 - 1, 0x0123456789ABCDEF):
+        assert bits(np.uint64(word)) == word.bit_count()
+    assert entry()(excess)(2.0, 1.0) == excess(2.0, 1.0) == 0.5

@@ -39,7 +39,7 @@ def check_study(path: Path, progress: Progress = silent) -> Findings:
     progress("check", 2, 3, "robot")
     reach = (
         None
-        if task.cell is None
+        if task.cell is None or task.sphere.depth is not None
         else JointMap.build(task.cell, task.sphere, task.scene.part).share(task.sphere.elevation)
     )
     progress("check", 3, 3)
@@ -68,6 +68,7 @@ def _record(task: Task, seen: Coverage, reach: dict[str, float] | None, problems
         "main_reason": {str(tag): reason for tag, reason in zip(seen.tag_ids, seen.main_reason, strict=True)},
         "admissible_share": seen.admissible,
         "least_images": seen.least_images,
+        "proved": seen.proved,
         "max_images": seen.max_images,
         "robot": reach,
         "problems": problems,
@@ -99,10 +100,12 @@ def _text(record: dict[str, Any]) -> str:
         lines.append(
             f"  tag {tag} is seen from {share:.1%} of the sphere, refused mostly by: {record['main_reason'][tag]}"
         )
-    lines.append(f"viewpoints {record['admissible_share']:.0%} of the sphere sees enough points for an image")
+    place = "sphere" if record["proved"] else "stations"
+    lines.append(f"viewpoints {record['admissible_share']:.0%} of the {place} sees enough points for an image")
     if record["least_images"]:
         lines.append(
-            f"images     at least {record['least_images']} are needed (proved), {record['max_images']} are allowed"
+            f"images     at least {record['least_images']} are needed"
+            f" ({'proved' if record['proved'] else 'over sampled stations'}), {record['max_images']} are allowed"
         )
     if record["robot"] is not None:
         parts = "  ".join(f"{name} {share:.1%}" for name, share in record["robot"].items() if share > 0)

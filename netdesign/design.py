@@ -16,7 +16,8 @@ from netdesign.model.progress import Progress, silent
 from netdesign.model.results import Design
 from netdesign.model.task import Task
 from netdesign.placement.finish import finish
-from netdesign.placement.problem import Problem
+from netdesign.placement.free_problem import problem_of
+from netdesign.placement.network_problem import NetworkProblem
 from netdesign.run_folder import run_folder, start_run
 from netdesign.search.engine import run as search
 from netdesign.search.state import State
@@ -56,7 +57,7 @@ def design_study(
         count = len(read_networks(run))
         return DesignOutcome(run=run, summary=f"{run}/design.json: {count} networks, finished before")
     numba.set_num_threads(max(1, min(threads, numba.config.NUMBA_NUM_THREADS)))
-    problem = Problem.build(task, progress)
+    problem = problem_of(task, progress)
     start_run(resolved, run)  # nothing is written before the study has turned out to be feasible
     state = _searched(task, problem, run / CHECKPOINT, resume, progress)
     design = finish(problem, state, progress)
@@ -65,7 +66,7 @@ def design_study(
     return DesignOutcome(run=run, summary=_summary(task, run, design, int(state.evaluations[-1])))
 
 
-def _searched(task: Task, problem: Problem, checkpoint: Path, resume: bool, progress: Progress) -> State:
+def _searched(task: Task, problem: NetworkProblem, checkpoint: Path, resume: bool, progress: Progress) -> State:
     """Return the finished state of the search; every few seconds, and when interrupted, it is kept on disk."""
     settings = task.study.search
     budget = settings.population * settings.generations

@@ -5,7 +5,8 @@ import numpy as np
 from netdesign.model.camera import Camera
 from netdesign.model.frames import look_at, sphere_directions
 from netdesign.model.scene import Part, Scene, Targets
-from netdesign.model.task import ViewingSphere, VisibilityLimits
+from netdesign.model.stations import ViewingSphere
+from netdesign.model.task import VisibilityLimits
 
 CAMERA = Camera(
     width_px=2448, height_px=2048, focal_px=[3600, 3600], principal_point_px=[1223.5, 1023.5], distortion=[0, 0, 0, 0]

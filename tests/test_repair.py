@@ -115,7 +115,7 @@ def test_stations_are_the_same_from_every_format(tmp_path):
         ("a.csv", "x_mm,y_mm,z_mm,qx,qy,qz,qw\n", "at least one station"),
         ("a.csv", "x_mm,y_mm,z_mm,qx,qy,qz,qw\n1,2,b,0,0,0,1\n", "a.csv:2: z_mm: expected a number, found 'b'"),
         ("a.csv", "x_mm,y_mm,z_mm,qx,qy,qz,qw\n1,2,3,0,0,0,0\n", "unit quaternion"),
-        ("images.txt", "1 1 0 0 0 1 2\n\n", "IMAGE_ID QW"),
+        ("images.txt", "1 1 0 0 0 1 2\n\n", "IMAGE_ID, qw"),
         ("images.txt", "# nothing\n", "at least one image"),
         ("a.json", "[]", "found no JSON object"),
         ("a.stl", "solid", "ends with '.stl'"),

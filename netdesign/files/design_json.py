@@ -107,6 +107,7 @@ def _network(number: int, network: DesignedNetwork, scales: tuple[float, float])
         "id": number,
         "objectives": [network.f1 / scales[0], network.f2 / scales[1], network.f3],
         "viewpoints_deg": np.degrees(network.viewpoints),
+        "radius_mm": None if network.radius is None else network.radius / MM,
         "world_from_cam_mm": world_from_cam_mm,
         "joints_rad": network.tour.joints,
         "rms_sigma_um": _rms_um(network.precision),

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from netdesign.errors import InputError
+from netdesign.files.colmap_text import read_images
 from netdesign.files.packages import resolve_path
 from netdesign.files.robot_program import stations_csv
 from netdesign.files.store import read_json
@@ -110,23 +111,8 @@ def _of_json(path: Path, network: str) -> Floats:
 
 
 def _of_colmap(path: Path) -> Floats:
-    """Poses of images.txt: one line of ten words per image, then a line of image points that may be empty."""
-    lines = [line for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if line[:1] != "#"]
-    rows, number = [], 0
-    while number < len(lines):
-        words = lines[number].split()
-        if not words:
-            number += 1
-            continue
-        try:
-            rows.append([float(word) for word in words[1:8]])
-            int(words[0]), int(words[8]), words[9]
-        except (ValueError, IndexError):
-            raise InputError(
-                f"{path}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, found {lines[number].strip()[:60]!r}"
-            ) from None
-        number += 2
-    if not rows:
+    images = read_images(path)
+    if not images:
         raise InputError(f"{path}: expected at least one image, found none")
-    values = np.array(rows)
-    return inverse(_poses(values[:, 4:], values[:, [1, 2, 3, 0]], path))
+    quaternions = np.array([image.quaternion for image in images])[:, [1, 2, 3, 0]]
+    return inverse(_poses(np.array([image.translation for image in images]), quaternions, path))

@@ -23,8 +23,9 @@ from netdesign.model.arrays import Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.frames import pose, rotation_from_rpy
 from netdesign.model.scene import Part, Scene, Targets
+from netdesign.model.stations import Depth, ViewingSphere
 from netdesign.model.study import CameraTable, PartTable, Study, ViewpointsTable, VisibilityTable
-from netdesign.model.task import Task, ViewingSphere, VisibilityLimits
+from netdesign.model.task import Task, VisibilityLimits
 from netdesign.photogrammetry.visibility import seen_share
 
 MM = 1e-3
@@ -215,9 +216,19 @@ def camera_of_table(table: CameraTable, path: Path) -> Camera:
 
 def _sphere(table: ViewpointsTable) -> ViewingSphere:
     azimuth, elevation = np.radians(table.azimuth_deg), np.radians(table.elevation_deg)
+    centre, depth = np.array(table.centre_mm) * MM, None
+    low, high = (np.array(values) * MM for values in table.extent_mm)
+    if table.box_mm is not None:
+        depth = Depth(shape="box", low=low - centre, high=high - centre)
+        farthest = float(np.linalg.norm(np.maximum(np.abs(depth.low), np.abs(depth.high))))
+    else:
+        farthest = float(high.max())
+        if isinstance(table.radius_mm, tuple) or table.semi_axes_mm is not None:
+            depth = Depth(shape="ellipsoid", low=low, high=high)
     return ViewingSphere(
-        centre=np.array(table.centre_mm) * MM,
-        radius=table.radius_mm * MM,
+        centre=centre,
+        radius=farthest,
+        depth=depth,
         azimuth=(float(azimuth[0]), float(azimuth[1])),
         elevation=(float(elevation[0]), float(elevation[1])),
         roll=None if table.roll_deg == "free" else float(np.radians(table.roll_deg)),
@@ -237,10 +248,29 @@ def _limits(table: VisibilityTable) -> VisibilityLimits:
 
 
 def _check_clearance(part: Part, sphere: ViewingSphere, table: PartTable, path: Path) -> None:
-    """Raise InputError when the part reaches the viewing sphere: mostly a mesh in another unit."""
-    reach = float(np.linalg.norm(part.vertices - sphere.centre, axis=1).max())
-    if reach >= sphere.radius:
+    """Raise InputError when the part reaches the nearest stations: mostly a mesh in another unit."""
+    offset = part.vertices - sphere.centre
+    reach = float(np.linalg.norm(offset, axis=1).max())
+    unit = f"(part.unit is {table.unit})"
+    if sphere.depth is None:
+        if reach >= sphere.radius:
+            raise InputError(
+                f"{path}: viewpoints.radius_mm: expected more than the part's reach of {reach / MM:.1f} mm from the "
+                f"centre {unit}, found {sphere.radius / MM:g}"
+            )
+        return
+    if sphere.depth.shape == "ellipsoid":
+        inside = np.linalg.norm(offset / sphere.depth.low, axis=1).max() < 1.0
+    else:
+        inside = reach < sphere.radius
+    if not inside:
         raise InputError(
-            f"{path}: viewpoints.radius_mm: expected more than the part's reach of {reach / MM:.1f} mm from the centre "
-            f"(part.unit is {table.unit}), found {sphere.radius / MM:g}"
+            f"{path}: viewpoints: expected stations outside of the part, which reaches {reach / MM:.1f} mm from the "
+            f"centre {unit}, found stations within it"
+        )
+    viewpoints, _ = sphere.sample(np.radians(2.0))
+    if not len(viewpoints):
+        raise InputError(
+            f"{path}: viewpoints.box_mm: expected a box that directions from centre_mm within elevation_deg and"
+            " azimuth_deg meet, found none that does"
         )

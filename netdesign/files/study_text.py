@@ -49,7 +49,7 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     """Return the first problem in words; an unknown key before the missing one that it was meant for."""
     problems = sorted(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
     problem = problems[0]
-    place = ".".join(str(part) for part in problem["loc"])
+    place = ".".join(str(part) for part in problem["loc"] if part not in ("single", "pair"))
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     if problem["type"] == "extra_forbidden":
         *tables, key = (str(part) for part in problem["loc"])

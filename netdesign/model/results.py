@@ -68,7 +68,7 @@ class DesignedNetwork:
     """One network of the front; per-image arrays are in visiting order.
 
     Attributes:
-        viewpoints: (n, 2) alpha, beta in rad.
+        viewpoints: (n, 2) alpha, beta in rad.  radius: (n,) m, distance from the centre, None: that of the sphere.
         world_from_cam: (n, 4, 4) m.
         f1, f2, f3: the objectives in SI units: m² (or m for the worst point), tour length, number of images.
         precision: the search criterion's propagation; total: full bundle adjustment, inner constraints over all points.
@@ -88,11 +88,14 @@ class DesignedNetwork:
     bound_ratio: float | None
     warnings: tuple[str, ...] = ()
     flagged: bool = False
+    radius: Floats | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "viewpoints", frozen("viewpoints", self.viewpoints, ("n", 2)))
         count = len(self.viewpoints)
         object.__setattr__(self, "world_from_cam", frozen("world_from_cam", self.world_from_cam, (count, 4, 4)))
+        if self.radius is not None:
+            object.__setattr__(self, "radius", frozen("radius", self.radius, (count,)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,13 +6,14 @@ An unknown key, a wrong type or a value out of range is an error that names the 
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Vector3 = tuple[Number, Number, Number]
 Range = tuple[Number, Number]
+Axes = tuple[Positive, Positive, Positive]
 
 
 class Table(BaseModel):
@@ -68,11 +69,30 @@ class CameraTable(Table):
     read_noise_e: NotNegative = 8
 
 
+def _single_or_pair(value: object) -> str:
+    return "pair" if isinstance(value, (list, tuple)) and len(value) == 2 else "single"
+
+
 class ViewpointsTable(Table):
-    """[viewpoints]: the viewing sphere."""
+    """[viewpoints]: where cameras may stand: one of radius_mm, semi_axes_mm and box_mm. All look at centre_mm."""
 
     centre_mm: Vector3 = (0, 0, 0)
-    radius_mm: Positive
+    radius_mm: (
+        Annotated[
+            Annotated[Positive, Tag("single")] | Annotated[tuple[Positive, Positive], Tag("pair")],
+            Discriminator(_single_or_pair),
+        ]
+        | None
+    ) = Field(None, description="of the viewing sphere; [least, largest]: any distance between the two")
+    semi_axes_mm: (
+        Annotated[
+            Annotated[Axes, Tag("single")] | Annotated[tuple[Axes, Axes], Tag("pair")], Discriminator(_single_or_pair)
+        ]
+        | None
+    ) = Field(None, description="of an ellipsoid about the centre, along x, y, z; [inner, outer]: between the two")
+    box_mm: tuple[Vector3, Vector3] | None = Field(
+        None, description="lowest and highest corner in the world frame; stations anywhere inside"
+    )
     elevation_deg: Range = (10, 90)
     azimuth_deg: Range = (-180, 180)
     roll_deg: Number | Literal["free"] = Field(0, description="about the optical axis; free: the robot chooses")
@@ -80,6 +100,28 @@ class ViewpointsTable(Table):
     existing: str | None = Field(
         None, description="stations that every network contains: design.json#ID, CSV of export, COLMAP images.txt"
     )
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> "ViewpointsTable":
+        given = [name for name in ("radius_mm", "semi_axes_mm", "box_mm") if getattr(self, name) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none"
+            raise ValueError(f"expected exactly one of radius_mm, semi_axes_mm and box_mm, found {found}")
+        low, high = self.extent_mm
+        if any(one > other for one, other in zip(low, high, strict=True)) or (self.box_mm and low == high):
+            raise ValueError(f"{given[0]}: expected [low, high], found {list(low)} above {list(high)}")
+        return self
+
+    @property
+    def extent_mm(self) -> tuple[Axes, Axes]:
+        """Semi-axes of the inner and outer ellipsoid, or the corners of the box; equal for a plain sphere."""
+        if self.box_mm is not None:
+            return self.box_mm
+        if self.semi_axes_mm is not None:
+            axes = self.semi_axes_mm
+            return axes if len(axes) == 2 else (axes, axes)
+        low, high = self.radius_mm if isinstance(self.radius_mm, tuple) else (self.radius_mm, self.radius_mm)
+        return (low,) * 3, (high,) * 3  # type: ignore[return-value]
 
     @model_validator(mode="after")
     def _ordered(self) -> "ViewpointsTable":
@@ -217,6 +259,11 @@ class Study(Table):
     def _motion_needs_a_robot(self) -> "Study":
         if self.robot is None and self.objectives.motion in ("joint", "time"):
             raise ValueError(f"objectives.motion: {self.objectives.motion} needs a [robot] table")
+        if self.motion != "workspace" and not isinstance(self.viewpoints.radius_mm, float | int):
+            raise ValueError(
+                f"viewpoints: expected one radius_mm for motion = {self.motion!r}, found a range or another shape;"
+                ' set objectives.motion = "workspace" (the robot is then not asked)'
+            )
         return self
 
     @property

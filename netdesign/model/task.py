@@ -7,46 +7,9 @@ import numpy as np
 
 from netdesign.model.arrays import Floats, frozen
 from netdesign.model.camera import Camera
-from netdesign.model.frames import look_at, sphere_directions
 from netdesign.model.scene import Scene
+from netdesign.model.stations import ViewingSphere
 from netdesign.model.study import Study
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewingSphere:
-    """The admissible stations: cameras on a sphere that look at its centre.
-
-    Attributes:
-        centre: (3,) m, world frame.  radius: m.
-        azimuth, elevation: (low, high) in rad, of alpha and beta.
-        roll: rad about the optical axis, None when the robot is free to choose it.
-        max_images: length of the structured chromosome.
-    """
-
-    centre: Floats
-    radius: float
-    azimuth: tuple[float, float]
-    elevation: tuple[float, float]
-    roll: float | None
-    max_images: int
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "centre", frozen("centre", self.centre, (3,)))
-
-    def cameras(self, viewpoints: Floats, roll: Floats | float | None = None) -> Floats:
-        """Return world_from_cam (…, 4, 4) of viewpoints (…, 2) = (alpha, beta) rad; roll defaults to the sphere's."""
-        position = self.centre + self.radius * sphere_directions(viewpoints)
-        return look_at(position, self.centre, (self.roll or 0.0) if roll is None else roll)
-
-    def sample(self, step: float) -> tuple[Floats, Floats]:
-        """Return viewpoints (c, 2) in the middle of equal steps of ``step`` rad and their shares (c,) of the area."""
-        (low_a, high_a), (low_b, high_b) = self.azimuth, self.elevation
-        rows, columns = max(1, round((high_b - low_b) / step)), max(1, round((high_a - low_a) / step))
-        edges = np.linspace(low_b, high_b, rows + 1)
-        alpha = np.linspace(low_a, high_a, columns + 1)[:-1] + 0.5 * (high_a - low_a) / columns
-        beta = 0.5 * (edges[1:] + edges[:-1])
-        share = np.diff(np.sin(edges)) / (np.sin(edges[-1]) - np.sin(edges[0])) / columns
-        return np.stack([np.tile(alpha, rows), np.repeat(beta, columns)], axis=1), np.repeat(share, columns)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,8 @@ from netdesign.errors import InputError
 from netdesign.model.arrays import Floats, Ints
 from netdesign.model.frames import transform
 from netdesign.model.scene import Part
-from netdesign.model.task import RobotCell, ViewingSphere
+from netdesign.model.stations import ViewingSphere
+from netdesign.model.task import RobotCell
 from netdesign.motion.capsules import fit_capsules
 from netdesign.motion.collision import Body, overlapping, part_field
 from netdesign.motion.kinematics import restarts

@@ -22,7 +22,8 @@ from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.compiled import entry
 from netdesign.model.frames import look_at, sphere_directions
 from netdesign.model.scene import Part
-from netdesign.model.task import RobotCell, ViewingSphere
+from netdesign.model.stations import ViewingSphere
+from netdesign.model.task import RobotCell
 from netdesign.motion.cell import ArmCell, load_arm
 from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION, REASONS, configuration_state
 from netdesign.motion.joint_lookup import MapArrays, map_arrays, options_of

@@ -19,7 +19,8 @@ from netdesign.model.arrays import Floats, Ints
 from netdesign.model.frames import sphere_directions
 from netdesign.model.results import Tour
 from netdesign.model.scene import Part
-from netdesign.model.task import RobotCell, ViewingSphere
+from netdesign.model.stations import ViewingSphere
+from netdesign.model.task import RobotCell
 from netdesign.motion.exact_tour import exact_joint_tour
 from netdesign.motion.joint_map import JointMap
 from netdesign.motion.joint_tour import NO_TURN, directions_tour, joint_tour, law_of, legs_along, work_for

@@ -54,6 +54,18 @@ def invert_normals(normal: Floats) -> Floats:
     return np.where(determined[:, None, None], inverse, np.inf)
 
 
+def variances_of(normal: Floats, least: float = SINGULAR) -> Floats:
+    """Return the variances (…, m, 3) along x, y, z of normal matrices (…, m, 6), xx xy xz yy yz zz.
+
+    inf where det N <= ``least`` (tr N)³.
+    """
+    xx, xy, xz, yy, yz, zz = np.moveaxis(normal, -1, 0)
+    minors = np.stack([yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy], axis=-1)
+    determinant = xx * minors[..., 0] + xy * (xz * yz - xy * zz) + xz * (xy * yz - xz * yy)
+    determined = determinant > least * (xx + yy + zz) ** 3
+    return np.where(determined[..., None], minors / np.where(determined, determinant, 1.0)[..., None], np.inf)
+
+
 def conditioning(normal: Floats) -> Floats:
     """Return det N / (tr N)³ (m,) of matrices (m, 3, 3): 1/27 for isotropic points, 0 for undetermined ones."""
     trace = np.trace(normal, axis1=1, axis2=2)

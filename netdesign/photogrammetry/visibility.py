@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.scene import CORNERS_PER_TAG, Scene, Targets
-from netdesign.model.task import ViewingSphere, VisibilityLimits
+from netdesign.model.stations import ViewingSphere
+from netdesign.model.task import VisibilityLimits
 from netdesign.photogrammetry.bvh import TriangleTree
 
 REASONS = ("seen", "behind", "incidence", "frame", "size", "depth of field", "occluded")

@@ -29,6 +29,7 @@ class Coverage:
         least_images: proven lower bound on the number of images that give every point its ``min_rays``; 0 when some
             tag is never or lonely, so that no number is enough.
         max_images, min_rays, min_points_per_image: of the study.
+        proved: False when there is no map, and never, lonely and least_images are those of the sample.
     """
 
     tag_ids: NDArray[np.int64]
@@ -42,6 +43,7 @@ class Coverage:
     max_images: int
     min_rays: int
     min_points_per_image: int
+    proved: bool = True
 
     @property
     def share(self) -> Floats:
@@ -69,9 +71,10 @@ class Coverage:
             reasons = [self.main_reason[g] for g in unseen]
             counts = ", ".join(f"{reasons.count(name)} by {name}" for name in REASONS if name in reasons)
             names = ", ".join(str(self.tag_ids[g]) for g in unseen[:8]) + (", …" if unseen.size > 8 else "")
+            kind = "admissible" if self.proved else "sampled"
             lines.append(
                 f"{unseen.size} of {len(self.never)} tags ({CORNERS_PER_TAG * unseen.size} object points) are seen "
-                f"from no admissible viewpoint (refused mostly: {counts}): tags {names}; targets.min_seen_share = 0.01 "
+                f"from no {kind} viewpoint (refused mostly: {counts}): tags {names}; targets.min_seen_share = 0.01 "
                 "leaves such tags out"
             )
         if self.lonely.any():
@@ -97,13 +100,17 @@ class Coverage:
 
 
 def coverage(task: Task, visibility_map: VisibilityMap | None = None) -> Coverage:
-    """Sample the sphere at two degrees with exact rays, and read from the map what is proved. A second of work."""
+    """Sample the sphere at two degrees with exact rays, and read from the map what is proved. A second of work.
+
+    Stations that are not on one sphere have no map: what the sample says is then all there is.
+    """
     scene, sphere, limits = task.scene, task.sphere, task.limits
-    if visibility_map is None:
+    proved = sphere.depth is None
+    if visibility_map is None and proved:
         visibility_map = VisibilityMap.build(scene, task.camera, sphere, limits)
     viewpoints, weights = sphere.sample(SAMPLE_STEP)
     reason = sightings(scene, task.camera, sphere.cameras(viewpoints), limits).reason
-    possible = _distinct(visibility_map)
+    possible = np.unique(reason == SEEN, axis=0) if visibility_map is None else _distinct(visibility_map)
     enough = possible.sum(axis=1) * CORNERS_PER_TAG >= limits.min_points_per_image
     never: Bools = np.equal(possible.any(axis=0), False)
     together: Bools = np.asarray(possible[enough].any(axis=0))
@@ -119,6 +126,7 @@ def coverage(task: Task, visibility_map: VisibilityMap | None = None) -> Coverag
         max_images=sphere.max_images,
         min_rays=limits.min_rays,
         min_points_per_image=limits.min_points_per_image,
+        proved=proved,
     )
 
 

@@ -38,6 +38,7 @@ class SphereTables(NamedTuple):
         criterion: MEAN_VARIANCE or MAX_SIGMA.
         in_joints: f2 comes from :func:`joint_tours`.  longest: admissible workspace f2.
         limits: (4,) lowest and highest azimuth, lowest and highest elevation, rad.
+        fixed: the first images of every network, which stay where they are.
     """
 
     points: Floats
@@ -55,6 +56,7 @@ class SphereTables(NamedTuple):
     in_joints: bool
     longest: float
     limits: Floats
+    fixed: int = 0
 
 
 class JointTables(NamedTuple):
@@ -88,7 +90,8 @@ def missing_sightings(cells: Ints, tables: SphereTables, at_least: NDArray[np.ui
     words = tables.sure.shape[1]
     at_least[:] = np.uint64(0)
     lacking = 0.0
-    for cell in cells:
+    for index in range(len(cells)):
+        cell = cells[index]
         seen = 0
         for w in range(words):
             row = tables.sure[cell, w]
@@ -96,7 +99,7 @@ def missing_sightings(cells: Ints, tables: SphereTables, at_least: NDArray[np.ui
             for r in range(tables.min_rays - 1, 0, -1):
                 at_least[r, w] |= at_least[r - 1, w] & row
             at_least[0, w] |= row
-        if seen < tables.min_tags:
+        if seen < tables.min_tags and index >= tables.fixed:
             lacking += float(tables.min_tags - seen) / tables.min_tags
     for r in range(tables.min_rays):
         enough = 0

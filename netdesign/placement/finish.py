@@ -23,10 +23,9 @@ from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_error import total_covariance
 from netdesign.photogrammetry.total_trace import block_trace
 from netdesign.photogrammetry.visibility import Sight
-from netdesign.placement.bound import lower_bounds
 from netdesign.placement.decide import round_up
-from netdesign.placement.problem import Problem
-from netdesign.placement.tolerance import cheapest_admissible, without_tour_limit
+from netdesign.placement.network_problem import NetworkProblem
+from netdesign.placement.tolerance import cheapest_admissible
 from netdesign.search.archive import non_dominated
 from netdesign.search.engine import run as search
 from netdesign.search.state import State
@@ -36,7 +35,7 @@ COARSE = 25.0  # times the smallest f1 of a front: five times its sigma
 SPARE = 1.5  # networks computed exactly per network kept: some fall to exact rays or to domination
 
 
-def finish(problem: Problem, state: State, progress: Progress = silent) -> Design:
+def finish(problem: NetworkProblem, state: State, progress: Progress = silent) -> Design:
     """Return the front of a finished (or interrupted) search.
 
     At most ``search.max_networks`` networks, spread over all sizes; f1 falls and f2 rises strictly along each size, and
@@ -77,7 +76,7 @@ def finish(problem: Problem, state: State, progress: Progress = silent) -> Desig
     kept = rest[spread(objectives[rest], max(1, most - (place is not None)))]
     kept = kept if place is None else np.append(kept, place)
     kept = kept[np.lexsort((objectives[kept, 1], objectives[kept, 0], objectives[kept, 2]))]
-    bounds = lower_bounds(task, sorted({networks[row].f3 for row in kept}), problem.visibility)
+    bounds = problem.bounds(sorted({networks[row].f3 for row in kept}))
     return Design(
         networks=tuple(_bounded(networks[row], bounds) for row in kept.tolist()),
         history=SearchHistory(evaluations=state.evaluations, hypervolume=state.hypervolume),
@@ -91,7 +90,7 @@ def finish(problem: Problem, state: State, progress: Progress = silent) -> Desig
 class Exact:
     """Scene, robot and sightings prepared once for many networks."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: NetworkProblem) -> None:
         self.problem = problem
         task = problem.task
         self.sight = Sight(task.scene, task.camera, task.limits)
@@ -102,15 +101,16 @@ class Exact:
         planned = self._planned(viewpoints)
         if isinstance(planned, str):
             return planned
-        viewpoints, world_from_cam, tour, warnings = planned
-        joint = self.problem.joint
-        if tour.length > (self.problem.tables.longest if joint is None else joint.longest):
+        world_from_cam, tour, warnings = planned
+        viewpoints, radius = task.sphere.placed(world_from_cam)
+        if tour.length > self.problem.longest:
             return "longer tour than requirements.max_tour"
         visible = self.sight.look(world_from_cam).visible
         rays = visible.sum(axis=0)
         if (rays < limits.min_rays).any():
             return f"a point with fewer than {limits.min_rays} exact rays"
-        if (visible.sum(axis=1) < limits.min_points_per_image).any():
+        given = np.linalg.norm(world_from_cam[:, None, :3, 3] - task.existing[:, :3, 3], axis=2) < 1e-6
+        if ((visible.sum(axis=1) < limits.min_points_per_image) & ~given.any(axis=1)).any():
             return f"an image with fewer than {limits.min_points_per_image} points"
         limited, total, complaints = predicted(task, world_from_cam, visible, rays)
         if not np.isfinite(limited.covariance).all():
@@ -128,6 +128,7 @@ class Exact:
             f1 = block_trace(world_from_cam, points, intrinsics, visible, sigma) / (3 * len(points))
         return DesignedNetwork(
             viewpoints=viewpoints,
+            radius=radius,
             world_from_cam=world_from_cam,
             f1=f1,
             f2=tour.length,
@@ -140,21 +141,22 @@ class Exact:
             flagged=bool(complaints),
         )
 
-    def _planned(self, viewpoints: Floats) -> tuple[Floats, Floats, Tour, Sequence[str]] | str:
-        """Viewpoints and poses in visiting order, the tour, warnings; or why the robot cannot."""
-        sphere = self.problem.task.sphere
+    def _planned(self, viewpoints: Floats) -> tuple[Floats, Tour, Sequence[str]] | str:
+        """Poses in visiting order, the tour, warnings; or why the robot cannot."""
         task = self.problem.task
+        poses = self.problem.poses(viewpoints)
         if self.problem.joint_map is not None:
             motion: Literal["joint", "time"] = "time" if task.study.motion == "time" else "joint"
-            plan = plan_on(self.problem.joint_map, viewpoints, motion, task.study.seed)
+            everything = np.concatenate([task.sphere.placed(task.existing)[0], viewpoints])
+            plan = plan_on(self.problem.joint_map, everything, motion, task.study.seed)
             if plan.tour is None:
                 return f"a station the robot cannot take ({', '.join(sorted({reason for _, reason in plan.refused}))})"
-            return plan.viewpoints, plan.world_from_cam, plan.tour, plan.warnings
-        positions = sphere.cameras(viewpoints)[:, :3, 3]
+            return plan.world_from_cam, plan.tour, plan.warnings
+        positions = poses[:, :3, 3]
         order, _ = open_path(np.linalg.norm(positions[:, None] - positions[None], axis=2), task.study.seed)
         length = float(np.linalg.norm(np.diff(positions[order], axis=0), axis=1).sum())
         tour = Tour(order=np.arange(len(order)), length=length, space="workspace")
-        return viewpoints[order], sphere.cameras(viewpoints[order]), tour, ()
+        return poses[order], tour, ()
 
 
 def predicted(
@@ -217,11 +219,14 @@ def _counts(dropped: Counter[str]) -> str:
     return ", ".join(f"{count} with {reason}" for reason, count in sorted(dropped.items()) if count)
 
 
-def _notes(problem: Problem, networks: Sequence[DesignedNetwork], dropped: Counter[str]) -> list[str]:
+def _notes(problem: NetworkProblem, networks: Sequence[DesignedNetwork], dropped: Counter[str]) -> list[str]:
     notes = []
     cover = problem.cover
     size, fewest = len(cover.viewpoints), min(network.f3 for network in networks)
-    if size:
+    existing = len(problem.task.existing)
+    if existing:
+        notes.append(f"every network contains the {existing} existing stations")
+    if size and not existing:
         optimal = (
             "no smaller choice of them does" if cover.least == size else f"of them at least {cover.least} are needed"
         )
@@ -235,25 +240,24 @@ def _notes(problem: Problem, networks: Sequence[DesignedNetwork], dropped: Count
     return notes
 
 
-def why_infeasible(problem: Problem, state: State) -> str:
+def why_infeasible(problem: NetworkProblem, state: State) -> str:
     """Return one line that says what the best network of a search without a feasible one still lacks."""
     task, limits, slots = problem.task, problem.task.limits, problem.chromosomes.slots
     cover = problem.cover
     if cover.least > slots:
         return (
-            f"viewpoints.max_images: over {cover.candidates} candidate stations at least {cover.least} images are"
-            f" needed to see every object point {limits.min_rays} times, allowed are {slots}"
+            f"viewpoints.max_images: over {cover.candidates} candidate stations at least"
+            f" {cover.least + len(task.existing)} images are needed to see every object point {limits.min_rays} times,"
+            f" allowed are {slots + len(task.existing)}"
         )
     best = int(np.argmin(state.population.violation))
     viewpoints = state.population.genes[best][state.population.bits[best]]
-    sees = problem.visibility.sure_tags(problem.visibility.cell_of(viewpoints))
-    lacking = sees.sum(axis=0) < limits.min_rays
+    sees = problem.sees(viewpoints)
+    lacking = sees.sum(axis=0) + problem.existing_sees.sum(axis=0) < limits.min_rays
     parts = []
     if lacking.any():
-        parts.append(
-            f"{4 * lacking.sum()} of {problem.tables.point_count} object points have fewer than {limits.min_rays} rays"
-        )
-    poor = (sees.sum(axis=1) < problem.tables.min_tags).sum()
+        parts.append(f"{4 * lacking.sum()} of {4 * len(lacking)} object points have fewer than {limits.min_rays} rays")
+    poor = (sees.sum(axis=1) < problem.min_tags).sum()
     if poor:
         parts.append(f"{poor} of {len(viewpoints)} images see fewer than {limits.min_points_per_image} points")
     if problem.joint_map is not None:
@@ -267,10 +271,10 @@ def why_infeasible(problem: Problem, state: State) -> str:
     return f"no admissible network among {state.evaluations[-1]} evaluated; of the nearest one " + ", ".join(parts)
 
 
-def _shortest(problem: Problem) -> str:
+def _shortest(problem: NetworkProblem) -> str:
     """What the tour takes at least: the same search without the limit."""
     study = problem.task.study
-    free = without_tour_limit(problem)
+    free = problem.without_tour_limit()
     found = search(free, study.search.engine, study.search.population, study.search.generations, study.seed)
     asked = f"no admissible network with a tour of at most {study.requirements.max_tour:g}"
     objectives = found.archive.members.objectives

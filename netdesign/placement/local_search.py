@@ -140,10 +140,10 @@ def improve_networks(
         value = w * np.log(f1) + (1.0 - w) * np.log(f2 + 1e-9)
         for c in range(tries.kind.shape[1]):
             kind = tries.kind[b, c]
-            i = k if kind == ADD else tries.camera[b, c] % k
+            i = k if kind == ADD else tables.fixed + tries.camera[b, c] % max(k - tables.fixed, 1)
             size = k + 1 if kind == ADD else (k - 1 if kind == REMOVE else k)
             violation[b, c], counts[b, c] = np.inf, 0
-            if size > slots or size < 2:
+            if size > slots or size < 2 or (kind != ADD and k == tables.fixed):
                 continue
             there = found[b, c]
             for x in range(k):

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from netdesign.errors import InfeasibleError
-from netdesign.model.arrays import Floats, Ints
-from netdesign.model.frames import sphere_directions
+from netdesign.errors import InfeasibleError, InputError
+from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
@@ -83,51 +82,99 @@ def joint_tables(task: Task, joint_map: JointMap | None) -> JointTables | None:
     )
 
 
-def candidates(
-    task: Task, visibility: VisibilityMap, joint_map: JointMap | None, tables: SphereTables
-) -> tuple[Floats, Ints]:
-    """Lattice viewpoints inside the range that the robot reaches and that see enough tags, and their cells."""
+def lattice_candidates(task: Task, visibility: VisibilityMap, joint_map: JointMap | None) -> Floats:
+    """Return lattice viewpoints (c, 2) inside the range that the robot reaches and that see enough tags."""
     viewpoints = Chromosomes(sphere=task.sphere, slots=1).spread(CANDIDATES)
     if joint_map is not None:
         viewpoints = viewpoints[joint_map.reachable(viewpoints)]
-    cells = visibility.cell_of(viewpoints)
-    enough = visibility.sure_tags(cells).sum(axis=1) >= tables.min_tags
-    return viewpoints[enough], cells[enough]
+    seen = visibility.sure_tags(visibility.cell_of(viewpoints)).sum(axis=1)
+    return np.asarray(viewpoints[seen * CORNERS_PER_TAG >= max(task.limits.min_points_per_image, 1)])
 
 
-def demanded_cover(task: Task, visibility: VisibilityMap, joint_map: JointMap | None, tables: SphereTables) -> Cover:
-    """Solve the set cover.
+def demanded_cover(
+    task: Task, stations: Floats, sees: Bools, already: Ints, slots: int, visibility: VisibilityMap | None
+) -> Cover:
+    """Solve the set cover of what existing stations leave to see.
+
+    Args:
+        stations: (c, d) candidates.  sees: (c, g).  already: (g,) rays of the existing stations.
+        slots: free images.  visibility: of the study, for the reasons; None when there is no map.
 
     Raises:
         InfeasibleError: no candidate sees enough, or a tag is seen from nowhere, or too many images are needed.
     """
-    viewpoints, cells = candidates(task, visibility, joint_map, tables)
-    if len(viewpoints) == 0:
+    needed = np.maximum(task.limits.min_rays - already, 0)
+    if len(stations) == 0:
+        reach = "within reach of the robot " if task.cell is not None and task.study.motion != "workspace" else ""
         raise InfeasibleError(
-            f"no viewpoint {'within reach of the robot ' if joint_map else ''}sees {tables.min_tags} tags"
+            f"no viewpoint {reach}sees {max(1, -(-task.limits.min_points_per_image // CORNERS_PER_TAG))} tags"
             f" (min_points_per_image = {task.limits.min_points_per_image}); `netdesign check` counts the reasons"
         )
-    cover = smallest_cover(viewpoints, visibility.sure_tags(cells), tables.min_rays, task.sphere.max_images)
-    if len(cover.viewpoints) == 0 or len(cover.viewpoints) > task.sphere.max_images:
+    cover = smallest_cover(stations, sees, needed, slots)
+    if needed.any() and not 0 < len(cover.viewpoints) <= slots:
         coverage(task, visibility).demand_feasible()
     return cover
 
 
-def hypervolume_scale(task: Task, tables: SphereTables, joint: JointTables | None, slots: int) -> Floats:
+def free_slots(task: Task) -> int:
+    """Return how many images a search may place beside the existing ones.
+
+    Raises:
+        InputError: none.
+    """
+    most = min(task.sphere.max_images, task.study.requirements.max_images or task.sphere.max_images)
+    if len(task.existing) >= most:
+        raise InputError(
+            f"viewpoints.existing: expected fewer stations than the {most} images that are allowed (max_images), found"
+            f" {len(task.existing)}; `netdesign repair` says what they are worth"
+        )
+    return most - len(task.existing)
+
+
+def pinned_viewpoints(task: Task) -> Floats:
+    """Return (e, 2) the viewpoints of the existing stations, which lie on the sphere.
+
+    Raises:
+        InputError: one does not, or it has another roll.
+    """
+    viewpoints, _ = task.sphere.placed(task.existing)
+    if not on_sphere(task):
+        raise InputError(
+            f"viewpoints.existing: expected stations on the viewing sphere, with its roll, for motion ="
+            f' {task.study.motion!r}; set objectives.motion = "workspace" for others'
+        )
+    return viewpoints
+
+
+def on_sphere(task: Task) -> bool:
+    """Tell whether every existing station is one of the viewing sphere's cameras (to 1 µm and 1e-5)."""
+    if not len(task.existing):
+        return True
+    viewpoints, _ = task.sphere.placed(task.existing)
+    if task.sphere.depth is not None or task.sphere.roll is None:
+        return False
+    inside = Chromosomes(sphere=task.sphere, slots=1).folded(viewpoints)
+    own = task.sphere.cameras(inside)
+    apart = np.abs(own - task.existing)
+    return bool(apart[:, :3, 3].max() < 1e-6 and apart[:, :3, :3].max() < 1e-5)
+
+
+def hypervolume_scale(task: Task, joint: JointTables | None, slots: int) -> Floats:
     """Ideal and reference point of the hypervolume.
 
     log f1 from the closed-form bound of ``slots`` images to 100 times it; f2 from 0 to the longest tour over ``slots``
     random stations in 20 samples; f3 from 1 to slots + 1.
     """
-    bound = 1.5 * tables.variance * (task.sphere.radius**2) / slots
+    camera, slots = task.camera, slots + len(task.existing)
+    bound = 1.5 * float(camera.sigma_px**2 / (camera.focal_px**2).mean()) * (task.sphere.radius**2) / slots
     samples = Chromosomes(sphere=task.sphere, slots=slots).uniform(np.random.default_rng(0), (20, slots))
     if joint is None:
-        longest = max(tables.radius * path_length(directions) for directions in sphere_directions(samples))
+        longest = max(path_length(poses[:, :3, 3]) for poses in task.sphere.cameras(samples))
     else:
         objectives = np.zeros((len(samples), 3))
         joint_tours(np.ones(samples.shape[:2], np.bool_), samples, joint, objectives, np.zeros(len(samples)))
         longest = float(objectives[:, 1].max())
-    if tables.criterion == MAX_SIGMA:
+    if task.study.objectives.precision == "max_sigma":
         ideal, reference = 0.5 * np.log(bound), 0.5 * np.log(100 * bound)
     else:
         ideal, reference = np.log(bound), np.log(100 * bound)

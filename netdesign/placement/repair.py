@@ -12,7 +12,7 @@ import numpy as np
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
-from netdesign.photogrammetry.limited_error import SINGULAR
+from netdesign.photogrammetry.limited_error import variances_of
 from netdesign.photogrammetry.visibility import Sight
 from netdesign.placement.distances import network_total_error
 from netdesign.placement.encoding import Chromosomes
@@ -121,14 +121,14 @@ class Standing:
         visible = self.sight.look(poses).visible
         added = information_of(self.task, poses, visible).reshape(len(visible), -1, 6)
         missing = np.maximum(self.task.limits.min_rays - rays - visible, 0).sum(axis=1)
-        trace = _variances(normal + added).sum(axis=2)
+        trace = variances_of(normal + added).sum(axis=2)
         determined = np.isfinite(trace)
         f1 = np.where(determined, trace, 0.0).sum(axis=1) / (3 * len(rays))
         return np.stack([missing, (~determined).sum(axis=1), f1], axis=1).astype(np.float64)
 
     def _quality(self, world_from_cam: Floats, visible: Bools, normal: Floats) -> Quality:
         rays = visible.sum(axis=0)
-        variances = _variances(normal)
+        variances = variances_of(normal)
         total = network_total_error(self.task, world_from_cam, visible) if len(world_from_cam) > 1 else None
         determined = total is not None and total.determined
         return Quality(
@@ -140,12 +140,3 @@ class Standing:
             short=int((rays < self.task.limits.min_rays).sum()),
             poor=int((visible.sum(axis=1) < self.task.limits.min_points_per_image).sum()),
         )
-
-
-def _variances(normal: Floats) -> Floats:
-    """(…, m, 3) diagonals of the inverses of normal matrices (…, m, 6); inf where the rays are parallel."""
-    xx, xy, xz, yy, yz, zz = np.moveaxis(normal, -1, 0)
-    minors = np.stack([yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy], axis=-1)
-    determinant = xx * minors[..., 0] + xy * (xz * yz - xy * zz) + xz * (xy * yz - xz * yy)
-    determined = determinant > SINGULAR * (xx + yy + zz) ** 3
-    return np.where(determined[..., None], minors / np.where(determined, determinant, 1.0)[..., None], np.inf)

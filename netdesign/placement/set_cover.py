@@ -1,18 +1,18 @@
 """The fewest images that see every tag often enough: a set cover, solved to proof over candidate stations.
 
-    minimise Σ x_c   subject to   Σ_c a_cg x_c >= min_rays for every tag g,   x_c in {0, 1}
+    minimise Σ x_c   subject to   Σ_c a_cg x_c >= needed_g for every tag g,   x_c in {0, 1}
 
 The candidates lie on a Fibonacci lattice, far enough apart that any two of them intersect well. The answer seeds the
 search and tells the user the least number of images these candidates allow. HiGHS is limited in nodes, never in
 seconds: the same study gives the same answer on every machine.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 
-from netdesign.model.arrays import Bools, Floats
+from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.frames import viewpoints_of
 
 CANDIDATES = 600
@@ -43,21 +43,24 @@ def lattice(count: int) -> Floats:
     return viewpoints_of(np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1))
 
 
-def smallest_cover(viewpoints: Floats, sees: Bools, min_rays: int, most: int) -> Cover:
-    """Return the smallest choice of candidates that sees every tag ``min_rays`` times.
+def smallest_cover(viewpoints: Floats, sees: Bools, needed: Ints, most: int) -> Cover:
+    """Return the smallest choice of candidates that sees every tag ``needed`` times.
 
     Args:
-        viewpoints: (c, 2) candidates.  sees: (c, g).  most: largest admissible number of images.
+        viewpoints: (c, d) candidates.  sees: (c, g).  needed: (g,) rays.  most: largest admissible number of images.
     """
-    none = Cover(viewpoints=np.zeros((0, 2)), candidates=len(viewpoints), least=most + 1)
-    if len(viewpoints) < 2 or (sees.sum(axis=0) < min_rays).any():
+    none = Cover(viewpoints=viewpoints[:0], candidates=len(viewpoints), least=most + 1)
+    if not needed.any():
+        return replace(none, least=0)
+    if len(viewpoints) < 2 or (sees.sum(axis=0) < needed).any():
         return none
-    needed = np.unique(sees, axis=1).astype(np.float64)  # tags seen by the same candidates need one row
+    # Tags seen by the same candidates need one row.
+    rows = np.unique(np.vstack([sees, needed])[:, needed > 0], axis=1).astype(np.float64)
     answer = milp(
         np.ones(len(viewpoints)),
         integrality=np.ones(len(viewpoints)),
         bounds=Bounds(0, 1),
-        constraints=[LinearConstraint(needed.T, lb=min_rays, ub=np.inf)],
+        constraints=[LinearConstraint(rows[:-1].T, lb=rows[-1], ub=np.inf)],
         options={"node_limit": NODES},
     )
     if answer.x is None:

@@ -13,9 +13,7 @@ import numpy as np
 
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.results import DesignedNetwork
-from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.photogrammetry.limited_error import direct_covariance
-from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_trace import propagated
 from netdesign.placement.decide import round_up
 from netdesign.placement.distances import (
@@ -26,8 +24,7 @@ from netdesign.placement.distances import (
     distance_u95,
     named_ends,
 )
-from netdesign.placement.preparation import candidates
-from netdesign.placement.problem import Problem
+from netdesign.placement.network_problem import NetworkProblem, sighting_array
 from netdesign.search.population import Population
 
 ROUNDS, MOVES = 80, 16  # of a climb, and networks tried in each
@@ -57,7 +54,7 @@ class Load:
         scale: (r,) exact value over the estimate of the climb.
     """
 
-    problem: Problem
+    problem: NetworkProblem
     names: tuple[str, ...]
     limits: Floats
     ends: Ints
@@ -65,7 +62,7 @@ class Load:
     scale: Floats = field(default_factory=lambda: np.ones(0))
 
     @staticmethod
-    def of(problem: Problem) -> "Load | None":
+    def of(problem: NetworkProblem) -> "Load | None":
         """Return the study's requirements on precision, None when there are none."""
         asked = problem.task.study.requirements
         names, limits = [], []
@@ -83,12 +80,9 @@ class Load:
 
     def estimated(self, viewpoints: Floats) -> Floats:
         """Return (r,) values in m of a network (k, 2) with sure sightings, not scaled; inf when not determined."""
-        task, visibility = self.problem.task, self.problem.visibility
-        poses, points, intrinsics = task.sphere.cameras(viewpoints), task.scene.targets.points, task.camera.intrinsics
-        visible = np.repeat(visibility.sure_tags(visibility.cell_of(viewpoints)), CORNERS_PER_TAG, axis=1)
-        sigma = np.array([[task.camera.sigma_px]])
-        if task.camera.corner_noise is not None:
-            sigma = sighting_sigma(task.camera, poses, task.scene.targets)
+        task, poses = self.problem.task, self.problem.poses(viewpoints)
+        points, intrinsics = task.scene.targets.points, task.camera.intrinsics
+        visible, sigma = self.problem.visible(viewpoints), sighting_array(task, poses)
         values = np.zeros(0)
         if len(self.ends):
             variances = propagated(poses, points, intrinsics, visible, sigma, self.functions, False)[1:]
@@ -108,7 +102,7 @@ class Load:
         return float((self.scale * self.estimated(viewpoints) / self.limits).max())
 
 
-def cheapest_admissible(problem: Problem, members: Population, exactly: Exactly) -> Answer | None:
+def cheapest_admissible(problem: NetworkProblem, members: Population, exactly: Exactly) -> Answer | None:
     """Return the network with fewest images, then the shortest tour, that keeps [requirements]; None without any.
 
     Args:
@@ -138,20 +132,21 @@ def cheapest_admissible(problem: Problem, members: Population, exactly: Exactly)
             if share > 1.0:
                 break
             meeting = [start for start, value in zip(starts, shares, strict=True) if value <= SAFE] or [viewpoints]
-            found = exactly(shorten(problem, load, min(meeting, key=lambda start: _tour(problem, start))))
+            shortened = shorten(problem, load, min(meeting, key=lambda start: _tour(problem, start)))
+            found = exactly(shortened)
             if isinstance(found, str):
                 break
             values = load.exact(found)
             if (values <= load.limits).all():
                 return Answer(network=found, reason=_met(load, values))
-            load = replace(load, scale=np.maximum(load.scale, values / load.estimated(found.viewpoints)) * (1 + 1e-6))
+            load = replace(load, scale=np.maximum(load.scale, values / load.estimated(shortened)) * (1 + 1e-6))
             shares = np.array([load.used(start) for start in starts])
             best = int(shares.argmin())
     assert nearest is not None
     return Answer(network=None, reason=_unmet(problem, load, nearest[1], exactly))
 
 
-def climb(problem: Problem, load: Load, viewpoints: Floats, rounds: int = ROUNDS) -> Floats:
+def climb(problem: NetworkProblem, load: Load, viewpoints: Floats, rounds: int = ROUNDS) -> Floats:
     """Move single cameras of a network (k, 2) while the largest share falls; stop once everything is met."""
     share = load.used(viewpoints)
     rng = np.random.default_rng([problem.task.study.seed, len(viewpoints), 1])
@@ -166,7 +161,7 @@ def climb(problem: Problem, load: Load, viewpoints: Floats, rounds: int = ROUNDS
     return viewpoints
 
 
-def shorten(problem: Problem, load: Load, viewpoints: Floats) -> Floats:
+def shorten(problem: NetworkProblem, load: Load, viewpoints: Floats) -> Floats:
     """Move single cameras of an admissible network (k, 2) while the tour becomes shorter and everything stays met."""
     tour = _tour(problem, viewpoints)
     rng = np.random.default_rng([problem.task.study.seed, len(viewpoints), 2])
@@ -179,7 +174,7 @@ def shorten(problem: Problem, load: Load, viewpoints: Floats) -> Floats:
     return viewpoints
 
 
-def _neighbours(problem: Problem, rng: np.random.Generator, viewpoints: Floats) -> tuple[Floats, Floats, Floats]:
+def _neighbours(problem: NetworkProblem, rng: np.random.Generator, viewpoints: Floats) -> tuple[Floats, Floats, Floats]:
     """(MOVES, k, 2) networks with one camera moved, their f2 and violation."""
     trials = np.tile(viewpoints, (MOVES, 1, 1))
     rows, moved = np.arange(MOVES), rng.integers(0, len(viewpoints), MOVES)
@@ -190,7 +185,7 @@ def _neighbours(problem: Problem, rng: np.random.Generator, viewpoints: Floats) 
     return trials, objectives[:, 1], violation
 
 
-def _tour(problem: Problem, viewpoints: Floats) -> float:
+def _tour(problem: NetworkProblem, viewpoints: Floats) -> float:
     everything: Bools = np.ones((1, len(viewpoints)), np.bool_)
     return float(problem.evaluate(everything, viewpoints[None])[0][0, 1])
 
@@ -202,19 +197,20 @@ def _met(load: Load, values: Floats) -> str:
     )
 
 
-def _unmet(problem: Problem, load: Load, viewpoints: Floats, exactly: Exactly) -> str:
+def _unmet(problem: NetworkProblem, load: Load, viewpoints: Floats, exactly: Exactly) -> str:
     """Return which requirement binds, the best that can be had, and what would satisfy it."""
     found = exactly(viewpoints)
     values = load.scale * load.estimated(viewpoints) if isinstance(found, str) else load.exact(found)
     over = values > load.limits
     if not over.any():
         over = values >= (values / load.limits).max() * load.limits
-    size = len(viewpoints)
+    fixed = len(problem.task.existing)
+    size = fixed + len(viewpoints)
     parts = [
         f"{load.names[row]} is at best {round_up(1e6 * values[row]):g} µm (required {1e6 * load.limits[row]:g})"
         for row in np.flatnonzero(over).tolist()
     ]
-    free = without_tour_limit(problem)
+    free = problem.without_tour_limit()
     easier = replace(load, problem=free, scale=np.maximum(load.scale, values / load.estimated(viewpoints)))
     ways = []
     if free is not problem:
@@ -223,26 +219,18 @@ def _unmet(problem: Problem, load: Load, viewpoints: Floats, exactly: Exactly) -
             ways.append(f"a tour of {_length(free, longer)} would reach it")
     enough = None if ways else _enlarged(free, easier, viewpoints)
     if enough is not None:
-        ways.append(f"{len(enough)} images would reach it, on a tour of {_length(free, enough)}")
+        ways.append(f"{fixed + len(enough)} images would reach it, on a tour of {_length(free, enough)}")
     elif not ways:
         ways.append(f"{MOST_IMAGES} images would not reach it")
     within = " within requirements.max_tour" if free is not problem else ""
     return f"no network meets the requirements: {' and '.join(parts)}{within} with {size} images; {' or '.join(ways)}"
 
 
-def without_tour_limit(problem: Problem) -> Problem:
-    """Return the problem without requirements.max_tour; itself when there is none."""
-    if problem.task.study.requirements.max_tour is None:
-        return problem
-    joint = None if problem.joint is None else problem.joint._replace(longest=np.inf)
-    return replace(problem, tables=problem.tables._replace(longest=np.inf), joint=joint)
-
-
-def _enlarged(problem: Problem, load: Load, viewpoints: Floats) -> Floats | None:
+def _enlarged(problem: NetworkProblem, load: Load, viewpoints: Floats) -> Floats | None:
     """The network with images added, each where it serves best, until the requirements are met; None if never."""
-    stations, _ = candidates(problem.task, problem.visibility, problem.joint_map, problem.tables)
+    stations = problem.candidates()
     stations = stations[:: max(1, len(stations) // 60)]
-    while len(viewpoints) < MOST_IMAGES:
+    while len(problem.task.existing) + len(viewpoints) < MOST_IMAGES:
         trials = np.concatenate([np.tile(viewpoints, (len(stations), 1, 1)), stations[:, None]], axis=1)
         viewpoints = trials[int(np.argmin([load.used(trial) for trial in trials]))]
         if load.used(viewpoints) < 1.05:
@@ -252,6 +240,6 @@ def _enlarged(problem: Problem, load: Load, viewpoints: Floats) -> Floats | None
     return None
 
 
-def _length(problem: Problem, viewpoints: Floats) -> str:
+def _length(problem: NetworkProblem, viewpoints: Floats) -> str:
     unit, scale = {"workspace": ("mm", 1e3), "joint": ("rad", 1.0), "time": ("s", 1.0)}[problem.task.study.motion]
     return f"{round_up(scale * _tour(problem, viewpoints)):g} {unit}"

@@ -18,7 +18,8 @@ from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.compiled import part
 from netdesign.model.scene import Scene
-from netdesign.model.task import ViewingSphere, VisibilityLimits
+from netdesign.model.stations import ViewingSphere
+from netdesign.model.task import VisibilityLimits
 from netdesign.photogrammetry.bvh import TriangleTree
 from netdesign.photogrammetry.occlusion import LARGEST_PATCH, neighbours
 from netdesign.photogrammetry.visibility import monotone_radius_squared, shadowed, sight_points, sight_settings

@@ -200,7 +200,7 @@ def _inputs(record: RunRecord) -> list[dict[str, str]]:
         ("Distortion k1 k2 p1 p2", ", ".join(f"{value:g}" for value in camera.distortion)),
         ("Depth of field", f"{near * 1e3:.0f} to {far * 1e3:.0f} mm" if np.isfinite(far) else "not limited"),
         ("Image noise per coordinate", noise),
-        ("Stations", f"sphere of {sphere.radius_mm:g} mm, elevation {sphere.elevation_deg[0]:g}° to "
+        ("Stations", f"{words.stations(sphere)}, elevation {sphere.elevation_deg[0]:g}° to "
                      f"{sphere.elevation_deg[1]:g}°, azimuth {sphere.azimuth_deg[0]:g}° to {sphere.azimuth_deg[1]:g}°, "
                      f"roll {sphere.roll_deg}{'' if sphere.roll_deg == 'free' else '°'}"),
         ("Visibility", f"incidence ≤ {limits.max_incidence_deg:g}°, tag ≥ {limits.min_tag_px:g} px, "

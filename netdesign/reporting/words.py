@@ -4,6 +4,7 @@ from collections import Counter
 
 import numpy as np
 
+from netdesign.model.study import ViewpointsTable
 from netdesign.reporting.record import UM, NetworkRecord, RunRecord
 
 LIMITED_DATUM = "exterior orientation error-free (limited error propagation)"
@@ -105,7 +106,7 @@ def verdict(record: RunRecord) -> str:
     proved, failed = counts["pass"], total - counts["pass"] - counts["not validated"]
     part = (
         f"For “{record.task.study.name}”: {len(record.task.scene.targets.ids)} tags on the part, "
-        f"seen from a sphere of {record.task.sphere.radius * 1e3:.4g} mm radius. "
+        f"seen from a {stations(record.task.study.viewpoints)}. "
     )
     if proved + failed == 0:
         return part + "Designed, not proved yet: every sigma below is a prediction."
@@ -191,3 +192,15 @@ def ellipsoid_words(factor: float, datum: str) -> str:
 def finite(value: float, digits: int = 2) -> str:
     """Return a number for a table, a dash when it is undetermined."""
     return f"{value:.{digits}f}" if np.isfinite(value) else "–"
+
+
+def stations(table: ViewpointsTable) -> str:
+    """Return where cameras may stand, in words that follow "a"."""
+    low, high = table.extent_mm
+    if table.box_mm is not None:
+        return "box from {:g}, {:g}, {:g} to {:g}, {:g}, {:g} mm".format(*low, *high)
+    if table.semi_axes_mm is not None:
+        between = "space between semi-axes of {:g}, {:g}, {:g} and ".format(*low)
+        inner = between if low != high else "shell with semi-axes of "
+        return inner + "{:g}, {:g}, {:g} mm".format(*high)
+    return f"sphere of {low[0]:g} mm radius" if low == high else f"distance of {low[0]:g} to {high[0]:g} mm"

@@ -1,0 +1,126 @@
+"""Where cameras may stand: a viewing sphere, or a body around its centre; every camera looks at the centre."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from netdesign.model.arrays import Bools, Floats, frozen
+from netdesign.model.frames import look_at, sphere_directions, viewpoints_of
+
+SHELLS = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Depth:
+    """The interval of distances from the centre that is admissible in every direction.
+
+    Attributes:
+        shape: ellipsoid (a sphere too): from the inner to the outer one; box: whatever lies inside.
+        low, high: (3,) m, semi-axes of the inner and outer ellipsoid along the world axes, or the lowest and highest
+            corner of the box relative to the centre.
+    """
+
+    shape: Literal["ellipsoid", "box"]
+    low: Floats
+    high: Floats
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "low", frozen("low", self.low, (3,)))
+        object.__setattr__(self, "high", frozen("high", self.high, (3,)))
+
+    @property
+    def has_width(self) -> bool:
+        """Whether the least and the largest distance differ."""
+        return self.shape == "box" or bool((self.low != self.high).any())
+
+    def limits(self, directions: Floats) -> tuple[Floats, Floats]:
+        """Return the least and largest distance (…) along unit directions (…, 3), m; least > largest: none."""
+        if self.shape == "ellipsoid":
+            near, far = (1.0 / np.linalg.norm(directions / axes, axis=-1) for axes in (self.low, self.high))
+            return near, far
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one, other = self.low / directions, self.high / directions
+        parallel = directions == 0.0
+        inside = (self.low <= 0.0) & (self.high >= 0.0)
+        enter = np.where(parallel, np.where(inside, -np.inf, np.inf), np.minimum(one, other)).max(axis=-1)
+        leave = np.where(parallel, np.where(inside, np.inf, -np.inf), np.maximum(one, other)).min(axis=-1)
+        return np.maximum(enter, 0.0), leave
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewingSphere:
+    """The admissible stations: cameras on a sphere, or within a depth about it, that look at its centre.
+
+    A viewpoint is (alpha, beta), or (alpha, beta, t) when there is a depth: t in [0, 1] goes from its least to its
+    largest distance.
+
+    Attributes:
+        centre: (3,) m, world frame.  radius: m; with a depth the largest distance of a station.
+        azimuth, elevation: (low, high) in rad, of alpha and beta.
+        roll: rad about the optical axis, None when the robot is free to choose it.
+        max_images: length of the structured chromosome.
+        depth: None for stations on the sphere itself.
+    """
+
+    centre: Floats
+    radius: float
+    azimuth: tuple[float, float]
+    elevation: tuple[float, float]
+    roll: float | None
+    max_images: int
+    depth: Depth | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "centre", frozen("centre", self.centre, (3,)))
+
+    @property
+    def genes(self) -> int:
+        """How many numbers say where a station is: 2, or 3 with a depth."""
+        return 2 if self.depth is None else 3
+
+    def radii(self, viewpoints: Floats) -> Floats:
+        """Return the distances (…) m of viewpoints (…, 2 or 3) from the centre; NaN where no station is admissible."""
+        if self.depth is None:
+            return np.full(viewpoints.shape[:-1], float(self.radius))
+        near, far = self.depth.limits(sphere_directions(viewpoints))
+        share = viewpoints[..., 2] if viewpoints.shape[-1] == 3 else 0.5
+        return np.asarray(np.where(near <= far, near + share * (far - near), np.nan))
+
+    def admissible(self, viewpoints: Floats) -> Bools:
+        """Return (…) whether there is a station at viewpoints (…, 2 or 3) within the ranges of the angles."""
+        return np.isfinite(self.radii(viewpoints))
+
+    def cameras(self, viewpoints: Floats, roll: Floats | float | None = None) -> Floats:
+        """Return world_from_cam (…, 4, 4) of admissible viewpoints (…, 2 or 3); roll defaults to the sphere's."""
+        position = self.centre + self.radii(viewpoints)[..., None] * sphere_directions(viewpoints)
+        return look_at(position, self.centre, (self.roll or 0.0) if roll is None else roll)
+
+    def placed(self, world_from_cam: Floats) -> tuple[Floats, Floats]:
+        """Return (alpha, beta) rad (…, 2) and distance m (…) of stations (…, 4, 4) as seen from the centre."""
+        offset = world_from_cam[..., :3, 3] - self.centre
+        return viewpoints_of(offset), np.linalg.norm(offset, axis=-1)
+
+    def sample(self, step: float) -> tuple[Floats, Floats]:
+        """Return viewpoints (c, 2 or 3) in the middle of equal steps and their shares (c,) of the area.
+
+        With a depth: on each of SHELLS, at twice the step (rad).
+        """
+        step = step if self.depth is None else 2.0 * step
+        (low_a, high_a), (low_b, high_b) = self.azimuth, self.elevation
+        rows, columns = max(1, round((high_b - low_b) / step)), max(1, round((high_a - low_a) / step))
+        edges = np.linspace(low_b, high_b, rows + 1)
+        alpha = np.linspace(low_a, high_a, columns + 1)[:-1] + 0.5 * (high_a - low_a) / columns
+        beta = 0.5 * (edges[1:] + edges[:-1])
+        share = np.diff(np.sin(edges)) / (np.sin(edges[-1]) - np.sin(edges[0])) / columns
+        viewpoints, shares = (
+            np.stack([np.tile(alpha, rows), np.repeat(beta, columns)], axis=1),
+            np.repeat(share, columns),
+        )
+        if self.depth is None:
+            return viewpoints, shares
+        there = self.admissible(viewpoints)
+        viewpoints, shares = viewpoints[there], shares[there]
+        shells = SHELLS if self.depth.has_width else (0.5,)
+        stations = np.concatenate([np.column_stack([viewpoints, np.full(len(viewpoints), t)]) for t in shells])
+        return stations, np.tile(shares / max(float(shares.sum()), 1e-300) / len(shells), len(shells))

@@ -1,0 +1,163 @@
+"""What every camera network problem offers to ``search`` and to ``finish``, whatever the stations."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from netdesign.model.arrays import Bools, Floats
+from netdesign.model.scene import CORNERS_PER_TAG
+from netdesign.model.task import Task
+from netdesign.motion.joint_map import JointMap
+from netdesign.photogrammetry.precision import sighting_sigma
+from netdesign.photogrammetry.total_trace import block_trace, total_trace
+from netdesign.placement.encoding import Chromosomes
+from netdesign.placement.optimal_design import information_of, rounded_networks
+from netdesign.placement.set_cover import Cover
+from netdesign.search.population import Population
+
+MOVES, REMOVALS, ADDITIONS = 40, 8, 4  # networks tried around one member in the local search
+TELEPORTS = 0.08  # share of the moves that go anywhere
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkProblem:
+    """A study, ready to be searched. Chromosomes hold the free stations; ``task.existing`` belong to every network.
+
+    Attributes:
+        chromosomes: the encoding and its operators.  cover: the smallest set cover found.
+        gauge: (3m, 7) of ``datum.inner_basis`` when the criterion is the total or block mean variance, else None.
+        scale: (2, 3) ideal and reference point of the normalised objectives (log f1, f2, f3).
+        joint_map: joints for every viewpoint, None when motion is measured in the workspace.
+    """
+
+    task: Task
+    chromosomes: Chromosomes
+    cover: Cover
+    scale: Floats
+    gauge: Floats | None = None
+    joint_map: JointMap | None = None
+
+    def evaluate(self, bits: Bools, genes: Floats) -> tuple[Floats, Floats]:
+        """Return objectives (P, 3) in SI units and violation (P,) of chromosomes."""
+        raise NotImplementedError
+
+    def improve(self, rng: np.random.Generator, members: Population) -> Population:
+        """Return evaluated neighbours of feasible members, found by a local search from each of them."""
+        raise NotImplementedError
+
+    def limited_scores(self, bits: Bools, genes: Floats) -> tuple[Floats, Floats]:
+        """Return f1 of the limited propagation and violation, whatever the tour and the criterion's propagation."""
+        raise NotImplementedError
+
+    def candidates(self) -> Floats:
+        """Return viewpoints (c, d) all over the admissible set, within reach, that see enough for an image."""
+        raise NotImplementedError
+
+    def sees(self, viewpoints: Floats) -> Bools:
+        """Return (k, g) the tags that are seen from viewpoints (k, d) for certain."""
+        raise NotImplementedError
+
+    def bounds(self, sizes: Iterable[int]) -> dict[int, float]:
+        """Return proven lower bounds on f1 by number of images; empty where nothing is proved."""
+        raise NotImplementedError
+
+    def without_tour_limit(self) -> Self:
+        """Return the problem without requirements.max_tour; itself when there is none."""
+        raise NotImplementedError
+
+    @property
+    def longest(self) -> float:
+        """The longest admissible tour, inf when there is no limit."""
+        raise NotImplementedError
+
+    @property
+    def existing_sees(self) -> Bools:
+        """(e, g) the tags that the existing stations see."""
+        return np.zeros((0, len(self.task.scene.targets.ids)), np.bool_)
+
+    @property
+    def min_tags(self) -> int:
+        """Tags that an image must see."""
+        return max(1, -(-self.task.limits.min_points_per_image // CORNERS_PER_TAG))
+
+    def poses(self, viewpoints: Floats) -> Floats:
+        """Return world_from_cam (e + k, 4, 4) of a network: the existing stations, then viewpoints (k, d)."""
+        return np.concatenate([self.task.existing, self.task.sphere.cameras(viewpoints)])
+
+    def visible(self, viewpoints: Floats) -> Bools:
+        """Return (e + k, m) which image of a network sees which object point."""
+        return np.repeat(np.concatenate([self.existing_sees, self.sees(viewpoints)]), CORNERS_PER_TAG, axis=1)
+
+    def random(self, rng: np.random.Generator, count: int) -> tuple[Bools, Floats]:
+        """Return random chromosomes."""
+        return self.chromosomes.random(rng, count)
+
+    def vary_plain(self, rng: np.random.Generator, first: Population, second: Population) -> tuple[Bools, Floats]:
+        """Return children by the source paper's operators."""
+        return self.chromosomes.vary_plain(rng, first, second)
+
+    def vary_structured(self, rng: np.random.Generator, first: Population, second: Population) -> tuple[Bools, Floats]:
+        """Return children by cut-and-splice and structural mutation."""
+        return self.chromosomes.vary_structured(rng, first, second)
+
+    def seeds(self) -> tuple[Bools, Floats]:
+        """Return the rounded optimal design of every size, the smallest cover, and larger networks that contain it."""
+        slots = self.chromosomes.slots
+        designed = self._designed()
+        genes = np.zeros((len(designed), slots, self.task.sphere.genes))
+        for row, viewpoints in enumerate(designed):
+            genes[row, : len(viewpoints)] = self.chromosomes.folded(viewpoints)
+        bits = np.arange(slots) < np.array([len(viewpoints) for viewpoints in designed], np.int64)[:, None]
+        cover_bits, cover_genes = self._cover_seeds()
+        return np.concatenate([bits, cover_bits]), np.concatenate([genes, cover_genes])
+
+    def _designed(self) -> list[Floats]:
+        """Networks near the best f1 of every size from that of the cover on, of stations of the set cover's lattice."""
+        viewpoints = self.candidates()
+        visible = np.repeat(self.sees(viewpoints), CORNERS_PER_TAG, axis=1)
+        flat = information_of(self.task, self.task.sphere.cameras(viewpoints), visible)
+        first = max(len(self.cover.viewpoints), 1 if len(self.task.existing) else 2)
+        return rounded_networks(viewpoints, flat, range(first, self.chromosomes.slots + 1), self.limited_scores)
+
+    def _cover_seeds(self) -> tuple[Bools, Floats]:
+        """The smallest cover, and larger networks that contain it: deterministic."""
+        size, slots = len(self.cover.viewpoints), self.chromosomes.slots
+        if size == 0 or size > slots:
+            return np.zeros((0, slots), np.bool_), np.zeros((0, slots, self.task.sphere.genes))
+        rng = np.random.default_rng(0)
+        count = 4 * (slots - size + 1)
+        genes = self.chromosomes.uniform(rng, (count, slots))
+        genes[:, :size] = self.chromosomes.folded(self.cover.viewpoints)
+        bits = np.arange(slots) < (size + np.arange(count) % (slots - size + 1))[:, None]
+        return bits, genes
+
+    def normalise(self, objectives: Floats) -> Floats:
+        """Return objectives (P, 3) with 0 at the ideal and 1 at the reference: log f1, f2, f3."""
+        values = np.stack([np.log(np.maximum(objectives[:, 0], 1e-300)), objectives[:, 1], objectives[:, 2]], axis=1)
+        return np.asarray((values - self.scale[0]) / (self.scale[1] - self.scale[0]))
+
+    def propagate_further(self, bits: Bools, genes: Floats, objectives: Floats, violation: Floats) -> None:
+        """Replace f1 of the feasible rows by total or block propagation; what is not determined becomes infeasible."""
+        if self.gauge is None:
+            return
+        task = self.task
+        points, intrinsics = task.scene.targets.points, task.camera.intrinsics
+        for row in np.flatnonzero(violation <= 0).tolist():
+            viewpoints = genes[row][bits[row]]
+            poses, visible = self.poses(viewpoints), self.visible(viewpoints)
+            sigma = sighting_array(task, poses)
+            if task.study.objectives.propagation == "block":
+                trace = block_trace(poses, points, intrinsics, visible, sigma)
+            else:
+                trace = total_trace(poses, points, intrinsics, visible, sigma, self.gauge)
+            objectives[row, 0] = trace / (3 * len(points))
+            violation[row] = 0.0 if np.isfinite(trace) else 0.5
+
+
+def sighting_array(task: Task, poses: Floats) -> Floats:
+    """Return the sigma (n, m) px of every sighting, or (1, 1) when it is constant, as the kernels take it."""
+    if task.camera.corner_noise is None:
+        return np.array([[task.camera.sigma_px]])
+    return sighting_sigma(task.camera, poses, task.scene.targets)

@@ -85,7 +85,9 @@ class ViewingSphere:
             return np.full(viewpoints.shape[:-1], float(self.radius))
         near, far = self.depth.limits(sphere_directions(viewpoints))
         share = viewpoints[..., 2] if viewpoints.shape[-1] == 3 else 0.5
-        return np.asarray(np.where(near <= far, near + share * (far - near), np.nan))
+        there = near <= far
+        near, far = np.where(there, near, np.nan), np.where(there, far, np.nan)
+        return np.asarray(near + share * (far - near))
 
     def admissible(self, viewpoints: Floats) -> Bools:
         """Return (…) whether there is a station at viewpoints (…, 2 or 3) within the ranges of the angles."""

@@ -74,7 +74,7 @@ def adjust_folder(
     if place.exists() and not place.is_dir():
         raise InputError(f"{place}: expected a folder to write adjustment.json into, found a file")
     progress("read", 0, 1)
-    found, blind, notes = _read(folder, sigma_px, progress)
+    found, blind, notes = _read(folder, sigma_px, tuple(refine or ()), progress)
     progress("read", 1, 1)
     control_path = _table(control, folder / "control.csv")
     bars_path = _table(scale_bars, folder / "scalebars.csv")
@@ -122,11 +122,11 @@ def adjust_folder(
 
 
 def _read(
-    folder: Path, sigma_px: float | None, progress: Progress
+    folder: Path, sigma_px: float | None, refine: tuple[str, ...], progress: Progress
 ) -> tuple[ObservationSet, tuple[str, ...], tuple[str, ...]]:
     """Return what the folder holds, the images that were left out, and what is to be said about it."""
     if is_photo_set(folder):
-        photos = read_photo_set(folder, sigma_px, progress)
+        photos = read_photo_set(folder, sigma_px, progress, refine)
         return photos.observations, (), photos.notes
     if any((folder / name).is_file() for name in MODEL_FILES):
         found, blind = read_observation_set(folder, sigma_px).without_blind_images()

@@ -52,12 +52,13 @@ def is_photo_set(folder: Path) -> bool:
     )
 
 
-def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress) -> PhotoSet:
+def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress, refine: tuple[str, ...] = ()) -> PhotoSet:
     """Measure the photographs and find approximate values.
 
     Args:
         sigma_px: noise of an image coordinate instead of the measured covariances; the pictures then need not follow
             the camera's sensor model.
+        refine: interior parameters that are not known well; free already where the scale is found.
 
     Raises:
         InputError: camera.toml, targets.csv or tags.csv is wrong.
@@ -65,7 +66,8 @@ def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress) -> 
     """
     photos = photos_in(folder)
     camera, targets, known = read_camera_and_targets(folder)
-    gates = None if sigma_px is None else Gates(chi2_base=LOOSE_CHI2)
+    # The sensor behind a photograph is rarely the one that camera.toml describes: each picture tells its own noise.
+    gates = Gates(own_noise=True) if sigma_px is None else Gates(chi2_base=LOOSE_CHI2)
     measured = measure_images(photos, camera, targets, gates=gates, progress=progress)
     good = [[tag for tag in tags if not tag.rejected] for tags in measured]
     refused = [tag.rejected for tags in measured for tag in tags if tag.rejected]
@@ -85,15 +87,41 @@ def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress) -> 
         notes.append(f"{len(refused)} tag image(s) were not believed, the first because: {refused[0]}")
     kept_names = tuple(named(names, seen))
     kept = [tags for tags in good if tags]
-    build = _on_nominal if known else _on_tags_alone
-    found = build(kept, kept_names, camera, targets, sigma_px)
-    rays = np.bincount(found.observations.point, minlength=len(found.points))
-    if (rays == 1).any():
-        # A point with one ray cannot be adjusted; photographs of a real part always show some tag only once.
-        once = named(found.point_names, rays == 1)
+    if known:
+        found, left_out = _tied(_on_nominal(kept, kept_names, camera, targets, sigma_px))
+    else:
+        found, left_out = _tied(_on_tags_alone(kept, kept_names, camera, targets, sigma_px, refine))
+    return PhotoSet(observations=found, notes=(*notes, *left_out))
+
+
+def _tied(found: ObservationSet) -> tuple[ObservationSet, list[str]]:
+    """Return the set without what hangs on a single sight, and what was left out.
+
+    A point with one ray cannot be adjusted, and photographs of a real part always show some tag only once; a
+    photograph that is left with less than a tag cannot be placed.
+
+    Raises:
+        InfeasibleError: fewer than two photographs remain.
+    """
+    observations = found.observations
+    before = np.bincount(observations.point, minlength=len(found.points))
+    while True:
+        rays = np.bincount(observations.point, minlength=len(found.points))
+        seen = np.bincount(observations.image, minlength=len(found.image_names))
+        keep = (rays[observations.point] > 1) & (seen[observations.image] >= CORNERS_PER_TAG)
+        if keep.all():
+            break
+        observations = observations.select(keep)
+    if len(np.unique(observations.image)) < 2:
+        raise InfeasibleError("expected at least 2 photographs that show the same tags, found none")
+    tied, blind = replace(found, observations=observations).without_blind_images()
+    notes = []
+    once = named(found.point_names, (before > 0) & (rays == 0))
+    if once:
         notes.append(f"{len(once)} point(s) are seen in one photograph only and are left out: {listed(once)}")
-        found = replace(found, observations=found.observations.select(rays[found.observations.point] > 1))
-    return PhotoSet(observations=found, notes=tuple(notes))
+    if blind:
+        notes.append(f"{len(blind)} photograph(s) share no tag with another and are left out: {listed(blind)}")
+    return tied, notes
 
 
 def _sightings(measured: Sequence[Sequence[TagMeasurement]], camera: Camera, targets: Targets) -> list[TagSighting]:
@@ -170,6 +198,7 @@ def _on_tags_alone(
     camera: Camera,
     targets: Targets,
     sigma_px: float | None,
+    refine: tuple[str, ...],
 ) -> ObservationSet:
     """Return the set with everything from the tags: poses, points, and the scale from their mean edge."""
     ids = sorted({tag.tag_id for tags in measured for tag in tags})
@@ -188,12 +217,11 @@ def _on_tags_alone(
     )
     points = transform(world_from_tag[:, None], square(seen.size_m)[None]).reshape(-1, 3)
     found = _set(names, seen, camera, poses, points, _observations(measured, seen, sigma_px))
-    rays = np.bincount(found.observations.point, minlength=len(points))
-    twice = found.observations.select(rays[found.observations.point] > 1)
-    adjusted = estimate(_problem(replace(found, observations=twice)), robust=True)
+    tied, _ = _tied(found)
+    adjusted = estimate(replace(_problem(tied), refine=refine), robust=True)
     points = np.where(adjusted.used[:, None], adjusted.points, points)
+    poses[[names.index(name) for name in tied.image_names]] = adjusted.world_from_cam
     scale = seen.size_m / _mean_edge(points, adjusted.used)
-    poses = adjusted.world_from_cam.copy()
     poses[:, :3, 3] *= scale
     return replace(found, world_from_cam=poses, points=points * scale)
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from netdesign.adjust import adjust_folder
 from netdesign.adjustment.initial import TagSighting, poses_and_tags, poses_on_known_tags
@@ -99,6 +100,23 @@ def test_rendered_photographs_known_and_unknown_part(tmp_path):
     known = adjust_folder(folder, robust=True)
     assert error_of(known)[1] < 40e-6
     assert 0.6 < known.adjustment.sigma0 < 1.6
+
+    # As a user brings them: compressed, names of a camera, one picture of nothing, the focal length from a catalogue.
+    phone = tmp_path / "phone"
+    phone.mkdir()
+    for number, path in enumerate(sorted((folder / "images").glob("*.png"))):
+        Image.open(path).convert("RGB").save(phone / f"IMG {4711 + number}.JPG", quality=92)
+    Image.new("RGB", (1224, 1024), (90, 100, 110)).save(phone / "IMG 4700.JPG")
+    (phone / "camera.toml").write_text((folder / "camera.toml").read_text().replace("1800, 1800", "1850, 1850"))
+    outcome = adjust_folder(phone, refine=("f", "cx", "cy"))
+    scale, error = error_of(outcome)
+    assert scale == pytest.approx(1.0, abs=2e-3)
+    assert error < 40e-6
+    assert 0.6 < outcome.adjustment.sigma0 < 1.6
+    assert outcome.adjustment.intrinsics[0, 0] == pytest.approx(
+        1800, abs=5 * np.sqrt(outcome.adjustment.parameter_covariance[0, 0])
+    )
+    assert any("show no usable tag and are left out: IMG 4700.JPG" in text for text in outcome.adjustment.warnings)
 
 
 def test_bad_image_sets_are_one_line(tmp_path):

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from netdesign.adjustment.absolute import absolute_comparison, absolute_prediction, repeatability_priors
 from netdesign.adjustment.bundle import adjust
 from netdesign.adjustment.compare import compare
 from netdesign.adjustment.correlated import correlated_covariance
@@ -19,7 +20,7 @@ from netdesign.adjustment.estimate import estimate
 from netdesign.adjustment.lengths import length_test
 from netdesign.adjustment.problem import BundleProblem
 from netdesign.errors import EnvironmentProblem, InputError, NetdesignError
-from netdesign.files.adjustment import adjustment_payload, length_payload, validation_payload
+from netdesign.files.adjustment import absolute_payload, adjustment_payload, length_payload, validation_payload
 from netdesign.files.design_json import PlannedNetwork
 from netdesign.files.store import read_json, write_json, write_text
 from netdesign.imageset import image_name, measure_images, observations_of, render_images
@@ -43,11 +44,15 @@ OUTLIER_SIGNIFICANCE = 1e-4  # data snooping at 1e-3 would bias s0² by 0.7 %
 
 
 def executed_poses(task: Task, network: PlannedNetwork, repeat: int = 0) -> Floats:
-    """Return where the camera really stood, (n, 4, 4) m: the plan plus a robot's error, drawn from the study's seed."""
+    """Return where the camera really stood, (n, 4, 4) m: the plan plus a robot's error, drawn from the study's seed.
+
+    The error has the robot's repeatability where the study states it, else the jitter of [validation].
+    """
     settings, count = task.study.validation, len(network.world_from_cam)
     random = np.random.default_rng([task.study.seed, network.id, repeat])
-    shift = random.normal(scale=settings.pose_jitter_mm * 1e-3, size=(count, 3))
-    turn = random.normal(scale=settings.pose_jitter_mrad * 1e-3, size=(count, 3))
+    position, rotation = (0.0, 0.0) if task.cell is None else task.cell.repeatability
+    shift = random.normal(scale=position or settings.pose_jitter_mm * 1e-3, size=(count, 3))
+    turn = random.normal(scale=rotation or settings.pose_jitter_mrad * 1e-3, size=(count, 3))
     error: Floats = network.world_from_cam @ pose(exp_rotation(turn), shift)
     return error
 
@@ -90,18 +95,19 @@ def prove_network(
         "image_points": len(observations),
     }
     try:
-        adjustment = _adjusted(task, network, observations, names)
+        start, adjustment = _adjusted(task, network, observations, names)
         joint = correlated_covariance(adjustment, _by_image_and_tag(observations, tag_covariances))
         limited, total = predictions(task, network)
         truth = task.scene.targets.points
         validation = compare(truth, adjustment, limited, total, level, seed=task.study.seed, joint_covariance=joint)
         lengths = length_payload(length_test(truth, adjustment), point_ids)
+        absolute = _in_robot_frame(task, network, start, level)
     except EnvironmentProblem:
         raise
     except NetdesignError as error:
         record |= {"verdict": "failed", "passed": False, "reasons": [str(error)], "warnings": []}
     else:
-        record |= validation_payload(validation, point_ids) | lengths
+        record |= validation_payload(validation, point_ids) | lengths | absolute
         record["verdict"] = "pass" if validation.passed else "fail"
         record["rejected_image_points"] = len(adjustment.rejected)
         write_json(
@@ -148,8 +154,10 @@ def observations_csv(observations: Observations, names: list[str], point_ids: tu
     return "\n".join(lines) + "\n"
 
 
-def _adjusted(task: Task, network: PlannedNetwork, observations: Observations, names: list[str]) -> Adjustment:
-    """Return the free adjustment from nominal values: gross errors out first, then GTSAM on what is left."""
+def _adjusted(
+    task: Task, network: PlannedNetwork, observations: Observations, names: list[str]
+) -> tuple[BundleProblem, Adjustment]:
+    """Return the problem without gross errors, from nominal values, and GTSAM's free adjustment of it."""
     start = BundleProblem(
         observations=observations,
         camera_of_image=np.zeros(len(names), dtype=np.int64),
@@ -169,7 +177,21 @@ def _adjusted(task: Task, network: PlannedNetwork, observations: Observations, n
         point_names=task.scene.targets.point_ids,
     )
     # Only the first adjustment knows which points lost their rays to its outlier test.
-    return replace(adjustment, rejected=cleaned.rejected, warnings=cleaned.warnings)
+    adjustment = replace(adjustment, rejected=cleaned.rejected, warnings=cleaned.warnings)
+    return replace(start, observations=cleaned.observations), adjustment
+
+
+def _in_robot_frame(task: Task, network: PlannedNetwork, problem: BundleProblem, level: float) -> dict[str, Any]:
+    """Return the entry "absolute" of validation.json for a robot whose repeatability is stated, else nothing."""
+    poses = network.world_from_cam
+    priors = None if task.cell is None else repeatability_priors(task.cell.repeatability, poses)
+    if priors is None:
+        return {}
+    targets = task.scene.targets
+    visible = sightings(task.scene, task.camera, poses, task.limits).visible
+    sigma = sighting_sigma(task.camera, poses, targets)
+    design = absolute_prediction(targets.points, priors, task.camera.intrinsics, visible, sigma)
+    return absolute_payload(absolute_comparison(targets.points, problem, priors, level), design, targets.point_ids)
 
 
 def _by_image_and_tag(observations: Observations, covariances: list[Floats]) -> dict[tuple[int, int], Floats]:

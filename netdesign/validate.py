@@ -116,4 +116,10 @@ def _line(record: dict[str, Any]) -> str:
         f"{predicted['total']:.2f} total at design, {predicted['used']:.2f} from the image points used; "
         f"rho {rho['value']:.3f} in [{rho['low']:.3f}, {rho['high']:.3f}]"
     )
+    if "absolute" in record:
+        absolute = record["absolute"]
+        text += (
+            f"; in the robot's frame {absolute['achieved_rms_um']:.2f} um achieved, "
+            f"{absolute['predicted_rms_um']['design']:.2f} at design"
+        )
     return text + (f"; {'; '.join(record['reasons'])}" if record["reasons"] else "")

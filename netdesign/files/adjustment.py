@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from netdesign.adjustment.absolute import Absolute
 from netdesign.adjustment.campaign import Band, Campaign, Member
 from netdesign.adjustment.lengths import LengthTest
 from netdesign.model.adjustment import Adjustment, Interval, Validation
@@ -163,6 +164,26 @@ def validation_payload(validation: Validation, point_names: Sequence[str]) -> di
             {"id": name, "error_um": error * 1e6} for name, error in zip(point_names, validation.errors, strict=True)
         ],
         **validation.details,
+    }
+
+
+def absolute_payload(absolute: Absolute, design_rms: float, point_names: Sequence[str]) -> dict[str, Any]:
+    """Return the entry "absolute" of a network's validation.json: uncertainty in the robot's frame, lengths in um.
+
+    Args:
+        design_rms: m, what the design promises.
+    """
+    return {
+        "absolute": {
+            "datum": "pose priors: the robot's repeatability",
+            "predicted_rms_um": {"design": design_rms * 1e6, "used": absolute.predicted_rms * 1e6},
+            "achieved_rms_um": absolute.achieved_rms * 1e6,
+            "rho": interval_payload(absolute.rho),
+            "points": [
+                {"id": name, "error_um": error * 1e6, "sigma_um": sigma * 1e6}
+                for name, error, sigma in zip(point_names, absolute.errors, absolute.sigma, strict=True)
+            ],
+        }
     }
 
 

@@ -171,8 +171,10 @@ class RobotTable(Table):
     dwell_s: NotNegative = 0.5
     margin_mm: NotNegative = 20
     obstacles: tuple[Obstacle, ...] = ()
-    repeatability_mm: NotNegative = Field(0, description="sigma of a robot position; 0: no pose priors")
-    repeatability_mrad: NotNegative = 0
+    repeatability_mm: NotNegative = Field(0, description="sigma per axis of the camera's position; 0: not known")
+    repeatability_mrad: NotNegative = Field(
+        0, description="the same of its rotation; both: pose priors, absolute sigma"
+    )
 
     @model_validator(mode="after")
     def _one_robot(self) -> "RobotTable":

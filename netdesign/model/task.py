@@ -41,7 +41,7 @@ class RobotCell:
         joint_weights: lambda of the source paper, None for all 1.
         obstacle_centres, obstacle_sizes: (b, 3) m, world-axis-aligned boxes.
         margin: m, distance the robot keeps from everything that is not itself.
-        repeatability: sigma of the flange pose, (position m, rotation rad).
+        repeatability: sigma per axis of the camera's pose, (position m, rotation rad); 0: not known.
         camera_radius, camera_length: m, the camera's body: a rounded cylinder behind the perspective centre.
     """
 

@@ -46,6 +46,8 @@ def article(record: RunRecord, network: NetworkRecord, picture: bytes) -> Values
         "ellipsoid_caption": words.ellipsoid_words(factor, words.SHORT_DATUM),
         "bars": charts.dot_chart(proof.bars(network), "µm"),
         "bars_caption": "Rms sigma per coordinate over all object points.",
+        "absolute": charts.dot_chart(absolute, "µm") if (absolute := proof.absolute_bars(network)) else "",
+        "absolute_caption": "Position, turn and scale included, as the robot's repeatability lets the poses be known.",
         "proof": proof.network_proof(network),
         "lengths": proof.length_proof(network),
         "thumbnails": [{"name": name, "uri": uri("jpeg", content)} for name, content in network.thumbnails],

@@ -88,6 +88,19 @@ def bars(network: NetworkRecord) -> list[tuple[str, str, float, str]]:
     return rows
 
 
+def absolute_bars(network: NetworkRecord) -> list[tuple[str, str, float, str]]:
+    """Return the rows of the chart in the robot's frame; none where the robot's repeatability is not stated."""
+    content = (network.validation or {}).get("absolute")
+    if content is None:
+        return []
+    predicted = content["predicted_rms_um"]
+    return [
+        ("P1 total, at design", "poses by repeatability", float(predicted["design"]), "total"),
+        ("P2 total, as measured", "poses by repeatability", float(predicted["used"]), "used"),
+        ("Achieved", "rms error, robot's frame", float(content["achieved_rms_um"]), "achieved"),
+    ]
+
+
 def adjustment_numbers(network: NetworkRecord) -> list[Values]:
     """Return what an adjustment protocol opens with."""
     content = network.adjustment

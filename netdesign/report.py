@@ -11,6 +11,7 @@ from netdesign.files.store import read_json, write_bytes, write_text
 from netdesign.files.study_text import study_toml
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.task import Task
+from netdesign.motion.joint_map import JointMap
 from netdesign.motion.robot import load_chain
 from netdesign.photogrammetry.limited_error import limited_covariance
 from netdesign.photogrammetry.precision import sighting_sigma
@@ -21,6 +22,7 @@ from netdesign.reporting import statics
 from netdesign.reporting.arm import Arm
 from netdesign.reporting.mesh import PartMesh
 from netdesign.reporting.pages import Pictures, page
+from netdesign.reporting.reach import Reach, reach_figure
 from netdesign.reporting.record import NetworkRecord, RunRecord
 from netdesign.reporting.statics import Raster, thumbnail
 from netdesign.run_folder import open_run
@@ -28,6 +30,7 @@ from netdesign.run_folder import open_run
 UM = 1e-6
 TRIANGLES = 20000  # of the part as it is drawn
 THUMBNAILS = 4
+REACH_SAMPLES = 4000
 SCREEN_WIDTH, PAPER_DPI = 1100, 170  # px, dots per inch
 
 
@@ -52,6 +55,9 @@ def write_report(run: Path) -> Path:
     arm = None if cell is None else Raster.of(cell, PAPER_DPI)
     if arm is not None:
         write_bytes(run / "figures" / "cell.png", arm.png())
+    reach = _reach(record, mesh)
+    if reach is not None:
+        write_bytes(run / "figures" / "reach.png", reach.png())
     achieved = statics.achieved_figure(record)
     proof = None if achieved is None else Raster.of(achieved, PAPER_DPI)
     if proof is not None:
@@ -60,11 +66,24 @@ def write_report(run: Path) -> Path:
         front=front.webp(SCREEN_WIDTH),
         networks=networks,
         cell=None if arm is None else arm.webp(SCREEN_WIDTH),
+        reach=None if reach is None else reach.webp(SCREEN_WIDTH),
         achieved=None if proof is None else proof.webp(SCREEN_WIDTH * 2 // 3),
     )
     path = run / "report.html"
     write_text(path, page(record, mesh, pictures, study_toml(record.task.study)))
     return path
+
+
+def _reach(record: RunRecord, mesh: PartMesh) -> Raster | None:
+    """Return the picture of what the robot reaches; None without a robot."""
+    task = record.task
+    if task.cell is None:
+        return None
+    joint_map = JointMap.build(task.cell, task.sphere, task.scene.part)
+    viewpoints = joint_map.lattice(samples=REACH_SAMPLES)
+    reach = Reach(viewpoints=viewpoints, reasons=tuple(joint_map.reasons(viewpoints)))
+    figure = reach_figure(record, mesh, reach)
+    return None if figure is None else Raster.of(figure, PAPER_DPI)
 
 
 def read_run(run: Path) -> RunRecord:

@@ -14,10 +14,11 @@ from matplotlib.figure import Figure
 from netdesign.errors import InputError
 from netdesign.files.store import read_json, write_json
 from netdesign.model.scene import Part
+from netdesign.motion.collision import REASONS
 from netdesign.motion.kinematics import forward
 from netdesign.motion.robot import load_chain
 from netdesign.report import read_run, write_report
-from netdesign.reporting import arm, charts, drawing, mesh, palette, payload, words
+from netdesign.reporting import arm, charts, drawing, mesh, palette, payload, reach, words
 from tests import cells
 from tests.runs import fail, pool_run, prove, ring_run
 from tests.scenes import CAMERA, box_part, ring
@@ -225,6 +226,12 @@ def test_the_drawn_arm_stands_where_the_kinematics_say():
         world_from_cam = cell.world_from_base @ base_from_flange @ cell.flange_from_cam
         assert np.allclose(drawn.world_from_links(row)[-1] @ drawn.last_from_cam, world_from_cam, atol=1e-12)
     assert sum(len(faces) for _, faces in drawn.posed(joints[0])) > 1000
+
+
+def test_every_reason_of_the_map_has_a_colour_and_a_share():
+    assert set(reach.COLOURS) == set(REASONS)
+    found = reach.Reach(viewpoints=np.zeros((4, 2)), reasons=("out of reach", "free", "free", "free"))
+    assert list(found.shares().items()) == [("free", 0.75), ("out of reach", 0.25)]
 
 
 def test_a_gridded_box_is_closed_and_faces_outwards():

@@ -155,3 +155,4 @@ def test_the_main_job_runs_on_a_user_s_arm_of_seven_joints(tmp_path):
     verdicts = [entry["verdict"] for entry in read_json(run / "validation.json", "validation")["networks"]]
     assert "failed" not in verdicts
     assert (run / "report.html").is_file()
+    assert {"cell.png", "reach.png"} <= {path.name for path in (run / "figures").iterdir()}

@@ -141,15 +141,22 @@ class JointMap:
         ]
 
     def share(self, elevation: tuple[float, float] | None = None, samples: int = 8000) -> dict[str, float]:
-        """Return the share of the sphere's admissible area for each reason, from a golden-angle lattice."""
+        """Return the share of the sphere's admissible area for each reason, from a golden-angle lattice.
+
+        Free is what all four nodes around a direction call free: a lower bound, 1 % below the exact share.
+        """
+        found = self.reasons(self.lattice(elevation, samples))
+        return {reason: found.count(reason) / samples for reason in REASONS}
+
+    def lattice(self, elevation: tuple[float, float] | None = None, samples: int = 8000) -> Floats:
+        """Return viewpoints (samples, 2) rad spread over the admissible sphere, each standing for the same area."""
         low, high = elevation or self.sphere.elevation
         alpha_low, alpha_high = self.sphere.azimuth
         index = np.arange(samples) + 0.5
         beta = np.arcsin(np.sin(low) + (np.sin(high) - np.sin(low)) * index / samples)
         golden = 0.5 * (np.sqrt(5.0) - 1.0)
         alpha = alpha_low + (alpha_high - alpha_low) * ((index * golden) % 1.0)
-        found = self.reasons(np.stack([alpha, beta], axis=1))
-        return {reason: found.count(reason) / samples for reason in REASONS}
+        return np.stack([alpha, beta], axis=1)
 
 
 def _rest(arm: ArmCell) -> float:

@@ -17,15 +17,20 @@ from netdesign.reporting.payload import as_script, payload
 from netdesign.reporting.record import RunRecord
 
 Values = dict[str, Any]
+REACH_CAPTION = (
+    "What the robot reaches, every dot the same share of the sphere, and the tour of the recommended network. Right: "
+    "the sphere from above, areas true. A direction is free where all four neighbours in the map are."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pictures:
-    """Static figures as WebP: the front, every network by id, the robot cell and achieved against predicted if any."""
+    """Static figures as WebP: the front, every network by id, robot cell, reach, achieved against predicted if any."""
 
     front: bytes
     networks: dict[int, bytes]
     cell: bytes | None
+    reach: bytes | None
     achieved: bytes | None
 
 
@@ -66,6 +71,7 @@ def page(record: RunRecord, mesh: PartMesh, pictures: Pictures, study_text: str)
             "achieved": uri("webp", pictures.achieved) if pictures.achieved else "",
         },
         cell={"uri": uri("webp", pictures.cell) if pictures.cell else "", "caption": _cell_caption(record)},
+        reach={"uri": uri("webp", pictures.reach) if pictures.reach else "", "caption": REACH_CAPTION},
         columns=_columns(record),
         rows=_rows(record),
         networks=[article(record, network, pictures.networks[network.id]) for network in record.networks],

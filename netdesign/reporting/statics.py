@@ -182,13 +182,8 @@ def cell_figure(record: RunRecord, mesh: PartMesh) -> Figure | None:
     joints = network.planned.get("joints_rad")
     if record.arm is None or joints is None:
         return None
-    poses, arm = network.world_from_cam, record.arm
-    table = [(*box_mesh(centre, size, steps=24), (0.78, 0.76, 0.72)) for centre, size in arm.obstacles]
-    part = [(mesh.vertices, mesh.faces, (0.93, 0.92, 0.89))]
-    body = [(vertices, faces, (0.62, 0.70, 0.76)) for vertices, faces in arm.posed(np.array(joints[0]))]
-    # The painter's order of large triangles errs where things stand on one another: what stands below comes first.
-    hand = CELL_EYE.nearness(np.concatenate([vertices for vertices, _, _ in body[-2:]])).mean()
-    groups = [table, part, body] if hand > CELL_EYE.nearness(mesh.vertices).mean() else [table, body, part]
+    poses = network.world_from_cam
+    groups = cell_solids(record, mesh, np.array(joints[0]))
     with rc_context(STYLE):
         figure = Figure(figsize=(9.6, 6.0))
         axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
@@ -208,8 +203,24 @@ def cell_figure(record: RunRecord, mesh: PartMesh) -> Figure | None:
         axes.plot(*flat.T, color=palette.TOUR, linewidth=1.2)
         for number, (x, y) in enumerate(flat, start=1):
             axes.annotate(str(number), (x, y), xytext=(4, 4), textcoords="offset points", fontsize=7.5)
-        _frame(axes)
+        frame(axes)
     return figure
+
+
+def cell_solids(record: RunRecord, mesh: PartMesh, joints: Floats) -> list[list[Any]]:
+    """Return what ``draw_solids`` takes of table, arm at joints (r,) and part, what stands behind or below first.
+
+    Raises:
+        ValueError: the run has no robot.
+    """
+    if record.arm is None:
+        raise ValueError("expected a run with a robot")
+    table = [(*box_mesh(centre, size, steps=24), (0.78, 0.76, 0.72)) for centre, size in record.arm.obstacles]
+    part = [(mesh.vertices, mesh.faces, (0.93, 0.92, 0.89))]
+    body = [(vertices, faces, (0.62, 0.70, 0.76)) for vertices, faces in record.arm.posed(joints)]
+    # The painter's order of large triangles errs where things stand on one another: what stands below comes first.
+    hand = CELL_EYE.nearness(np.concatenate([vertices for vertices, _, _ in body[-2:]])).mean()
+    return [table, part, body] if hand > CELL_EYE.nearness(mesh.vertices).mean() else [table, body, part]
 
 
 def exaggeration(record: RunRecord, covariance: Floats) -> float:
@@ -240,7 +251,7 @@ def _stations(axes: Axes, record: RunRecord, network: NetworkRecord, mesh: PartM
     axes.scatter(flat[:, 0], flat[:, 1], s=14, color=color, zorder=4)
     for number, (x, y) in enumerate(flat, start=1):
         axes.annotate(str(number), (x, y), xytext=(4, 4), textcoords="offset points", fontsize=7.5, zorder=5)
-    _frame(axes)
+    frame(axes)
 
 
 def _ellipsoids(axes: Axes, record: RunRecord, network: NetworkRecord, mesh: PartMesh) -> float:
@@ -253,7 +264,7 @@ def _ellipsoids(axes: Axes, record: RunRecord, network: NetworkRecord, mesh: Par
     front[front] = ~hidden(mesh.tree, points[front], EYE.axes[2])
     draw_tags(axes, EYE, mesh.tree, points.reshape(-1, 4, 3), np.asarray(targets.normals), PALE_TAG)
     draw_ellipsoids(axes, EYE, points, network.total, factor, palette.PREDICTED_TOTAL, front)
-    _frame(axes)
+    frame(axes)
     if not finite.any():
         axes.text(0.5, 0.5, "not determined", transform=axes.transAxes, ha="center", color=palette.BAD)
     return factor
@@ -264,7 +275,7 @@ def _title(axes: Axes, text: str) -> None:
     axes.text(0.0, 1.02, text, transform=axes.transAxes, fontsize=9.5, fontweight="bold")
 
 
-def _frame(axes: Axes) -> None:
+def frame(axes: Axes) -> None:
     """Leave nothing but the drawing, undistorted."""
     axes.autoscale_view()
     axes.margins(0.03)

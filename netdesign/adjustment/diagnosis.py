@@ -251,7 +251,7 @@ def _variance_warning(adjustment: Adjustment) -> tuple[str, ...]:
         return ()
     return (
         f"sigma0 {adjustment.sigma0:.3f} lies outside [{low:.3f}, {high:.3f}] (99.9 %): the a-priori sigma of the "
-        "image points is not theirs, or something is not modelled",
+        "image points is not theirs, or something is not modelled (gross errors: --robust; the lens: --refine)",
     )
 
 

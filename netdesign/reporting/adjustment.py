@@ -1,5 +1,7 @@
 """What a person wants to know first of an adjustment, in plain lines; every sigma with its datum."""
 
+from math import floor, isfinite, log10
+
 import numpy as np
 
 from netdesign.model.adjustment import Adjustment
@@ -37,7 +39,7 @@ def adjustment_text(adjustment: Adjustment) -> str:
     for index, (name, value) in enumerate(zip(adjustment.parameter_names, sigma.tolist(), strict=True)):
         key = name.split()[-1]
         row = adjustment.intrinsics[index // share]
-        lines.append(f"{name:<12} {row[0 if key == 'f' else INTRINSICS.index(key)]:.9g} +- {value:.3g}")
+        lines.append(f"{name:<12} {_with_sigma(float(row[0 if key == 'f' else INTRINSICS.index(key)]), value)}")
     return "\n".join([*lines, *(f"warning      {text}" for text in adjustment.warnings)])
 
 
@@ -47,6 +49,14 @@ def _sigmas(covariance: Floats, factor: float) -> str:
     if len(variance) == 0:
         return "not determined"
     return f"{_length(float(np.sqrt(variance.mean())))} rms, {_length(float(np.sqrt(variance.max())))} worst"
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    """Return a value to the digits that its sigma knows."""
+    if not (isfinite(sigma) and sigma > 0):
+        return f"{value:.9g}"
+    decimals = max(0, 2 - floor(log10(sigma)))
+    return f"{value:.{decimals}f} +- {sigma:.{decimals}f}"
 
 
 def _rms(values: Floats) -> float:

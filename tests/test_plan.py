@@ -5,7 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
+from netdesign.errors import InputError
+from netdesign.files.robot_program import urscript
 from netdesign.model.frames import look_at, sphere_directions
+from netdesign.motion.cell import load_arm
 from netdesign.motion.exact_tour import exact_joint_tour
 from netdesign.motion.joint_map import JointMap
 from netdesign.motion.joint_tour import law_of
@@ -13,6 +16,7 @@ from netdesign.motion.kinematics import base_from_flange
 from netdesign.motion.legs import Legs
 from netdesign.motion.options import exact_options
 from netdesign.motion.plan import plan_on, tour_length
+from netdesign.motion.program import program_of, sampled
 from netdesign.motion.timing import leg_law, leg_time
 from netdesign.motion.tour import nearest_neighbour_3opt
 from tests.cells import PART, arm, cell, joint_map, reachable_viewpoints
@@ -102,6 +106,40 @@ def test_a_leg_through_the_part_goes_over_via_points():
     assert vias is not None
     for a, b in itertools.pairwise([start, *vias, end]):
         assert not of_map.arm.meshes.leg_contact(a, b, 0.02)
+
+
+def test_the_ways_from_home_and_back_are_free():
+    """Folded up beside the table: a straight line from there may lead through it."""
+    home = (0.3, -1.9, 2.3, -2.0, -1.57, 0.2)
+    here = load_arm(cell(home=home), sphere(), PART)
+    of_map = JointMap.of_arm(here, sphere(roll=0.0))
+    drawn = reachable_viewpoints(of_map, 5, 2)
+    plan, without = plan_on(of_map, drawn), plan_on(joint_map(), drawn)
+    assert plan.tour.length == without.tour.length
+    program = program_of(of_map, plan.tour.joints)
+    np.testing.assert_array_equal(program.waypoints[[0, -1]], [home, home])
+    assert program.station[program.station >= 0].tolist() == [0, 1, 2, 3, 4]
+    assert program.station[0] == program.station[-1] == -1
+    for a, b in itertools.pairwise(program.waypoints):
+        assert not here.meshes.leg_contact(a, b, 0.02)
+    trajectory = sampled(program)
+    assert trajectory.stop.sum() == 2 * 5
+    assert not trajectory.stop[[0, -1]].any()
+    assert urscript(program, 0).count(": tcp") == len(program.waypoints)
+    assert urscript(program, 0).count("# home") == 2
+
+
+@pytest.mark.parametrize(
+    ("home", "message"),
+    [
+        ((0.0,) * 5, "expected 6 numbers"),
+        ((7.0, 0, 0, 0, 0, 0), r"shoulder_pan_joint: expected a value in"),
+        ((0.0, 0.6, 0, 0, 0, 0), "at which nothing touches, found: .*obstacle 1"),
+    ],
+)
+def test_a_home_where_the_arm_cannot_stand_is_refused(home, message):
+    with pytest.raises(InputError, match=rf"robot\.home_rad: .*{message}"):
+        load_arm(cell(home=home), sphere(), PART)
 
 
 def test_the_trapezoid_against_reference_values():

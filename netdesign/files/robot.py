@@ -54,6 +54,7 @@ def resolve_cell(table: RobotTable, folder: Path) -> RobotCell:
         margin=table.margin_mm * MM,
         obstacle_centres=np.array([box.position_mm for box in boxes]).reshape(-1, 3) * MM,
         obstacle_sizes=np.array([box.box_mm for box in boxes]).reshape(-1, 3) * MM,
+        home=table.home_rad,
         repeatability=(table.repeatability_mm * MM, table.repeatability_mrad * MM),
     )
 

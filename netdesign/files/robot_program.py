@@ -89,15 +89,20 @@ def urscript(program: Program, network: int) -> str:
     flange = cell.flange_from_cam
     lines = [
         f"def netdesign_network_{network}():",
-        "  # Joints in rad. Drive to the first station by hand first: the way there has not been tested.",
+        f"  # Joints in rad. Drive to {'the first station' if cell.home is None else 'home'} by hand first: "
+        "the way there has not been tested.",
         f"  set_tcp(p[{_numbers([*flange[:3, 3], *Rotation.from_matrix(flange[:3, :3]).as_rotvec()])}])",
     ]
     previous = program.waypoints[0]
-    for q, station, tcp in zip(program.waypoints, program.station, program.controller_from_cam, strict=True):
+    for index, (q, station, tcp) in enumerate(
+        zip(program.waypoints, program.station, program.controller_from_cam, strict=True)
+    ):
+        # A via point never is the first or the last of a program.
+        rest = "home" if index in (0, len(program.waypoints) - 1) else "via point"
         moved = np.abs(q - previous) > 1e-9
         speed = float(chain.speed[moved].min()) if moved.any() else float(chain.speed.min())
         acceleration = float(chain.acceleration.min())
-        lines.append(f"  # {'via point' if station < 0 else f'station {station}'}: tcp p[{_numbers(_ur_pose(tcp))}]")
+        lines.append(f"  # {rest if station < 0 else f'station {station}'}: tcp p[{_numbers(_ur_pose(tcp))}]")
         lines.append(f"  movej([{_numbers(q)}], a={acceleration:.6f}, v={speed:.6f})")
         if station >= 0:
             lines.append(f"  sleep({cell.dwell:.3f})")

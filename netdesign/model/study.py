@@ -171,6 +171,9 @@ class RobotTable(Table):
     dwell_s: NotNegative = 0.5
     margin_mm: NotNegative = 20
     obstacles: tuple[Obstacle, ...] = ()
+    home_rad: tuple[Number, ...] | None = Field(
+        None, description="joints where a program starts and ends; the ways there are checked, and are not in f2"
+    )
     repeatability_mm: NotNegative = Field(0, description="sigma per axis of the camera's position; 0: not known")
     repeatability_mrad: NotNegative = Field(
         0, description="the same of its rotation; both: pose priors, absolute sigma"

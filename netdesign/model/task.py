@@ -41,6 +41,7 @@ class RobotCell:
         joint_weights: lambda of the source paper, None for all 1.
         obstacle_centres, obstacle_sizes: (b, 3) m, world-axis-aligned boxes.
         margin: m, distance the robot keeps from everything that is not itself.
+        home: rad, where a program starts and ends; None: at the first and the last station.
         repeatability: sigma per axis of the camera's pose, (position m, rotation rad); 0: not known.
         camera_radius, camera_length: m, the camera's body: a rounded cylinder behind the perspective centre.
     """
@@ -60,6 +61,7 @@ class RobotCell:
     margin: float = 0.02
     obstacle_centres: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     obstacle_sizes: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    home: tuple[float, ...] | None = None
     repeatability: tuple[float, float] = (0.0, 0.0)
     camera_radius: float = 0.03
     camera_length: float = 0.09

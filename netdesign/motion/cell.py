@@ -62,7 +62,8 @@ def load_arm(cell: RobotCell, sphere: ViewingSphere, part: Part) -> ArmCell:
     """Load the robot and fit its capsules; what takes long is kept on disk by content.
 
     Raises:
-        InputError: see ``load_chain``; or joint_weights of another length than the arm has joints.
+        InputError: see ``load_chain``; or joint_weights of another length than the arm has joints; or a home that is
+            not free.
     """
     chain = load_chain(cell)
     if cell.joint_weights is not None and len(cell.joint_weights) != len(chain):
@@ -84,6 +85,7 @@ def load_arm(cell: RobotCell, sphere: ViewingSphere, part: Part) -> ArmCell:
     boxes = np.concatenate([cell.obstacle_centres, 0.5 * cell.obstacle_sizes], axis=1)
     meshes = MeshCell(placed, camera, part, boxes, cell.margin)
     meshes.pairs = learn_pairs(meshes, placed, pairs_key(chain, camera))
+    _check_home(cell, chain, meshes)
     capsules, owner = _capsules(chain)
     capsules[owner_links(chain, owner) == 0] = _moved(capsules[owner_links(chain, owner) == 0], cell.world_from_base)
     capsules = np.concatenate([capsules, camera])
@@ -112,6 +114,21 @@ def load_arm(cell: RobotCell, sphere: ViewingSphere, part: Part) -> ArmCell:
     return ArmCell(
         cell=cell, chain=chain, placed=placed, ur=ur_arm(placed), body=body, loose=loose, meshes=meshes, key=key
     )
+
+
+def _check_home(cell: RobotCell, chain: Chain, meshes: MeshCell) -> None:
+    """Raise when the arm cannot stand at home."""
+    if cell.home is None:
+        return
+    if len(cell.home) != len(chain):
+        names = ", ".join(chain.joint_names)
+        raise InputError(f"robot.home_rad: expected {len(chain)} numbers ({names}), found {len(cell.home)}")
+    for name, value, low, high in zip(chain.joint_names, cell.home, chain.lower, chain.upper, strict=True):
+        if not low <= value <= high:
+            raise InputError(f"robot.home_rad: {name}: expected a value in [{low:g}, {high:g}], found {value:g}")
+    contact = meshes.contact(np.array(cell.home))
+    if contact:
+        raise InputError(f"robot.home_rad: expected joints at which nothing touches, found: {contact}")
 
 
 def _without_false_alarms(body: Body, meshes: MeshCell, placed: Chain) -> tuple[Body, bool]:

@@ -24,8 +24,8 @@ class Program:
     """The motion of one network.
 
     Attributes:
-        waypoints: (w, r) rad, stations and via points in order.
-        station: (w,) number of the station in visiting order, -1 for a via point.
+        waypoints: (w, r) rad, stations and via points in order, home first and last where the cell has one.
+        station: (w,) number of the station in visiting order, -1 for a via point and for home.
         base_from_cam: (w, 4, 4) m, base = the URDF's root.  controller_from_cam: the same in the controller's base.
     """
 
@@ -46,24 +46,26 @@ class Program:
 
 
 def program_of(joint_map: JointMap, joints: Floats) -> Program:
-    """Return the program over joints (n, r) in visiting order; legs that collide get via points.
+    """Return the program over joints (n, r) in visiting order, from home and back; legs that collide get via points.
 
     Raises:
         InfeasibleError: a leg for which no free way is found.
     """
     arm = joint_map.arm
     legs = Legs(joint_map)
-    waypoints, station = [joints[0]], [0]
-    for number, (start, end) in enumerate(itertools.pairwise(joints)):
+    home = [] if arm.cell.home is None else [(-1, np.array(arm.cell.home))]
+    stops = [*home, *enumerate(joints), *home]
+    waypoints, station = [stops[0][1]], [stops[0][0]]
+    for leg, ((_, start), (number, end)) in enumerate(itertools.pairwise(stops), start=1):
         contact = legs.contact(start, end)
         if contact:
             vias = legs.detour(start, end)
             if vias is None:
-                raise InfeasibleError(f"leg {number + 1}: no free way from station {number}: {contact}")
+                raise InfeasibleError(f"leg {leg}: no free way: {contact}")
             waypoints += list(vias)
             station += [-1] * len(vias)
         waypoints.append(end)
-        station.append(number + 1)
+        station.append(number)
     path = np.array(waypoints)
     world_from_cam = camera_poses(arm, path)
     base_from_cam = inverse(arm.cell.world_from_base) @ world_from_cam
@@ -114,7 +116,12 @@ def sampled(program: Program, rate: float = 25.0) -> Trajectory:
     """
     arm = program.arm
     speed, acceleration = arm.chain.speed * (1.0 - _HEADROOM), arm.chain.acceleration * (1.0 - _HEADROOM)
-    times, joints, velocity, stop = [0], [program.waypoints[0]], [np.zeros(len(arm.chain))], [True]
+    times, joints, velocity, stop = (
+        [0],
+        [program.waypoints[0]],
+        [np.zeros(len(arm.chain))],
+        [bool(program.station[0] >= 0)],
+    )
     clock = 0
 
     def rest(duration: float) -> None:
@@ -126,7 +133,8 @@ def sampled(program: Program, rate: float = 25.0) -> Trajectory:
             velocity.append(np.zeros(len(arm.chain)))
             stop.append(True)
 
-    rest(arm.cell.dwell)
+    if program.station[0] >= 0:
+        rest(arm.cell.dwell)
     for index in range(1, len(program.waypoints)):
         start, end = program.waypoints[index - 1], program.waypoints[index]
         law = leg_law(start, end, speed, acceleration)

@@ -366,3 +366,35 @@ def test_images_without_points_and_tables_of_a_spreadsheet(tmp_path):
     again = adjust_folder(tmp_path / "b", sigma_px=0.1).record
     for a, b in zip(base["points"], again["points"], strict=True):
         np.testing.assert_allclose(b["sigma_mm"], a["sigma_mm"], rtol=1e-9)
+
+
+def test_bars_in_every_role(tmp_path):
+    """Between fixed points, at weighted control, many at once, free of error; and error-free ones that are too many."""
+    project = part()
+    points = project.points
+    which = np.array([0, 1, 5, 9])
+    control = (which, points[which], np.array([1e-5, 0, 0, 1e-5]))
+    a, b = np.array([1, 0, 9]), np.array([5, 1, 20])
+    length = np.linalg.norm(points[a] - points[b], axis=1) + 1e-5
+    joined = replace(project, control=control, bars=(a, b, length, np.array([1e-5, 1e-5, 2e-5])))
+    record = _adjusted(tmp_path / "joined", joined, sigma_px=0.1, refine=("f", "k1"))
+    assert max(disagreement(joined, record, "control", ("f", "k1"))) < 1e-8
+    assert record["n_observations"] == 2 * len(project.image) + 6 + 3
+    pairs = np.array([(i, j) for i in range(8) for j in range(i)])
+    length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    many = replace(project, bars=(*pairs.T, length, np.full(28, 1e-5)))
+    assert max(disagreement(many, _adjusted(tmp_path / "many", many, sigma_px=0.1), "scale")) < 1e-9
+    exact = replace(project, bars=(*pairs[:3].T, length[:3], np.zeros(3)))
+    assert _adjusted(tmp_path / "exact", exact, sigma_px=0.1)["n_datum"] == 6
+    with pytest.raises(InfeasibleError, match=r"10 of the error-free scale bars follow from the others"):
+        _adjusted(tmp_path / "too many", replace(project, bars=(*pairs.T, length, np.zeros(28))), sigma_px=0.1)
+
+
+@pytest.mark.parametrize("sigma", [1e-9, 1e-4, 1e-2])
+def test_control_may_be_exact_or_poor(tmp_path, sigma):
+    """From a nanometre to a twentieth of the object: the network is as good as it is, its frame as the control."""
+    project = part()
+    which = np.array([0, 5, 9])
+    project = replace(project, bars=None, control=(which, project.points[which], np.full(3, sigma)))
+    record = _adjusted(tmp_path, project, sigma_px=0.1, refine=ALL)
+    assert max(disagreement(project, record, "control", ALL)) < 1e-5

@@ -90,8 +90,11 @@ def appraise(
     _refuse(complaints and complaints + calibration_complaints(problem, parameter_names, None))
     mask = datum_mask(problem, layout)
     covariance = _in_datum(problem, layout, reduced, camera_side, g_camera, g_points, mask, with_joint)
-    inner = _inner_blocks(problem, layout, reduced, camera_side, covariance, open_)
-    _refuse(network_complaints(problem, layout, inner, lost, float(noise)))
+    # The scale is transformed away only where image points alone would have to give it.
+    parts = problem, layout, reduced, camera_side, covariance
+    inner = _inner_blocks(*parts, open_, parameters=7 if open_ == 7 else 6)
+    shape = inner if open_ == 7 else _inner_blocks(*parts, open_, parameters=7)
+    _refuse(network_complaints(problem, layout, shape, lost, float(noise)))
     first, last = 6 * layout.images, int(layout.parameter_start[-1])
     parameter_covariance = covariance.camera[first:last, first:last]
     _refuse(calibration_complaints(problem, parameter_names, parameter_covariance))
@@ -170,16 +173,16 @@ def _inner_blocks(
     camera_side: CameraSide,
     covariance: DatumCovariance,
     open_: int,
+    parameters: int,
 ) -> Floats:
     """Return the points' covariances (m, 3, 3) by S-transformation to inner constraints over all adjusted points.
 
     What is left is the inner precision of the network: without the uncertainty of the frame that control points or
-    priors bring in. The scale is transformed away only where image points alone would have to give it.
+    priors bring in.
     """
     adjusted = layout.eliminated | layout.kept
-    if adjusted.sum() < 3 or (open_ >= 6 and problem.datum_points is None):
+    if adjusted.sum() < 3 or (open_ == parameters and problem.datum_points is None):
         return covariance.points.copy()
-    parameters = 7 if open_ == 7 else 6
     g_camera = np.zeros((layout.width, parameters))
     origin = problem.middle()
     g_points = point_null_space(problem.points, origin, parameters)

@@ -55,17 +55,17 @@ def point_complaints(problem: BundleProblem, layout: Layout, lost: Bools) -> tup
 
 
 def network_complaints(
-    problem: BundleProblem, layout: Layout, inner: Floats, lost: Bools, noise: float
+    problem: BundleProblem, layout: Layout, shape: Floats, lost: Bools, noise: float
 ) -> tuple[str, ...]:
     """Return a complaint when the points are known no better than to a share of the object itself.
 
     Args:
-        inner: (m, 3, 3) covariance over inner constraints, in units of the object's extent.  noise: factor on sigma.
+        shape: (m, 3, 3) covariance over 7 inner constraints, in units of the object's extent.  noise: factor on sigma.
     """
     judged = (layout.eliminated | layout.kept) & ~lost
     if judged.sum() < 3:
         return ()
-    worst = np.sqrt(np.maximum(np.linalg.eigvalsh(inner[judged])[:, -1], 0.0)) * noise
+    worst = np.sqrt(np.maximum(np.linalg.eigvalsh(shape[judged])[:, -1], 0.0)) * noise
     typical = float(np.median(worst))
     if typical <= HOPELESS_NETWORK:
         return ()

@@ -212,6 +212,22 @@ def check_input(problem: BundleProblem) -> None:
             raise InfeasibleError(f"{len(missing)} datum point(s) are observed in no image: {listed(missing)}")
 
 
+def _dependent_bars(problem: BundleProblem) -> int:
+    """Return how many error-free bars, of those that are not between fixed points, say what others say already."""
+    bars, layout = problem.active_bars, problem.layout()
+    if bars is None or not (bars.sigma == 0).any():
+        return 0
+    exact = bars.sigma == 0
+    a, b = bars.a[exact], bars.b[exact]
+    direction = problem.points[b] - problem.points[a]
+    rows = np.zeros((len(a), len(problem.points), 3))
+    rows[np.arange(len(a)), a], rows[np.arange(len(a)), b] = -direction, direction
+    flat = rows[:, layout.kept].reshape(len(a), -1)
+    length = np.linalg.norm(flat, axis=1)
+    flat = flat[length > 0] / length[length > 0, None]
+    return len(flat) - int(np.linalg.matrix_rank(flat, tol=1e-9)) if flat.size else 0
+
+
 def check_start(problem: BundleProblem) -> None:
     """Raise on what no adjustment can repair: missing rays, loose blocks, an open datum, points behind their camera.
 
@@ -234,6 +250,11 @@ def check_start(problem: BundleProblem) -> None:
         raise InfeasibleError(
             f"datum {problem.datum}: {int(problem.known().sum())} control point(s) leave {open_} of 7 datum "
             "parameters open; expected at least 3 that do not lie on one line"
+        )
+    dependent = _dependent_bars(problem)
+    if dependent:
+        raise InfeasibleError(
+            f"{dependent} of the error-free scale bars follow from the others, or contradict them: give them a sigma"
         )
     observations = problem.observations
     _, depth = project(

@@ -5,9 +5,10 @@ import itertools
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
-from netdesign.model.arrays import Floats
+from netdesign.model.arrays import Floats, Ints
 from netdesign.motion.collision import FREE, leg_state
 from netdesign.motion.joint_map import JointMap
+from netdesign.motion.robot import Chain
 
 # 0.02 rad moves the tip of an outstretched UR10 by 26 mm: between two tests it stays within the margin of 20 mm.
 _STEP = 0.02
@@ -92,3 +93,34 @@ class Legs:
         turned = joints + np.where(placed.wraps, _TURN * np.rint((middle - joints) / _TURN), 0.0)
         inside = (turned >= placed.lower) & (turned <= placed.upper)
         return np.ascontiguousarray(np.where(inside, turned, joints))
+
+
+def turned_towards(home: Floats, joints: Floats, chain: Chain) -> Floats:
+    """Return a tour (n, r) with every joint turned as a whole, inside its limits, so that its ends are near home (r,).
+
+    Whole turns of a joint along the whole tour change neither a pose nor a leg.
+    """
+    best, ends = joints.copy(), joints[[0, -1]]
+    for a in np.flatnonzero(chain.wraps):
+        lowest, highest = joints[:, a].min(), joints[:, a].max()
+        fit = [
+            turn for turn in (0.0, _TURN, -_TURN) if chain.lower[a] <= lowest + turn <= highest + turn <= chain.upper[a]
+        ]
+        gaps = [float(np.abs(ends[:, a] + turn - home[a]).sum()) for turn in fit]
+        best[:, a] += fit[int(np.argmin(gaps))] if fit else 0.0
+    return best
+
+
+def home_legs(
+    legs: Legs, home: Floats, joints: Floats, order: Ints
+) -> tuple[tuple[str, ...], tuple[tuple[int, str], ...]]:
+    """Return what is to be said about the ways from home to the first station and back, and who cannot be reached."""
+    notes: list[str] = []
+    for station, name in ((0, "the way from home"), (len(joints) - 1, "the way home")):
+        contact = legs.contact(home, joints[station])
+        found = legs.detour(home, joints[station]) if contact else None
+        if contact and found is None:
+            return (), ((int(order[station]), f"no free way between home and this station: {contact}"),)
+        if found is not None:
+            notes.append(f"{name} goes over {len(found)} via point(s): on the straight line {contact}")
+    return tuple(notes), ()

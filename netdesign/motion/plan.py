@@ -25,7 +25,7 @@ from netdesign.motion.exact_tour import exact_joint_tour
 from netdesign.motion.joint_map import JointMap
 from netdesign.motion.joint_tour import NO_TURN, directions_tour, joint_tour, law_of, legs_along, work_for
 from netdesign.motion.kinematics import forward
-from netdesign.motion.legs import Legs
+from netdesign.motion.legs import Legs, home_legs, turned_towards
 from netdesign.motion.options import StationOptions, exact_options, lifted
 from netdesign.motion.tour import open_path
 
@@ -117,9 +117,11 @@ def plan_on(joint_map: JointMap, viewpoints: Floats, motion: Literal["joint", "t
     starts = _starts(modulo, viewpoints, seed)
     legs = Legs(joint_map)
     order, joints, notes = _repaired(modulo, starts, legs, arm.placed.lower, arm.placed.upper)
+    if arm.cell.home is not None:
+        joints = turned_towards(np.array(arm.cell.home), joints, arm.placed)
     vias, more, refused = _vias(legs, joints, order)
     if arm.cell.home is not None and not refused:
-        from_home, refused = _home_legs(legs, np.array(arm.cell.home), joints, order)
+        from_home, refused = home_legs(legs, np.array(arm.cell.home), joints, order)
         more += from_home
     if refused:
         return Plan(tour=None, world_from_cam=np.zeros((0, 4, 4)), viewpoints=np.zeros((0, 2)), refused=refused)
@@ -279,18 +281,3 @@ def _vias(
             vias[leg] = found
             notes.append(f"leg {leg + 1} goes over {len(found)} via point(s): on the straight line {contact}")
     return vias, tuple(notes), tuple(refused)
-
-
-def _home_legs(
-    legs: Legs, home: Floats, joints: Floats, order: Ints
-) -> tuple[tuple[str, ...], tuple[tuple[int, str], ...]]:
-    """Return what is to be said about the ways from home to the first station and back, and who cannot be reached."""
-    notes: list[str] = []
-    for station, name in ((0, "the way from home"), (len(joints) - 1, "the way home")):
-        contact = legs.contact(home, joints[station])
-        found = legs.detour(home, joints[station]) if contact else None
-        if contact and found is None:
-            return (), ((int(order[station]), f"no free way between home and this station: {contact}"),)
-        if found is not None:
-            notes.append(f"{name} goes over {len(found)} via point(s): on the straight line {contact}")
-    return tuple(notes), ()

@@ -13,6 +13,7 @@ from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
 from netdesign.placement.coverage import Coverage, coverage
 from netdesign.placement.distances import named_ends
+from netdesign.placement.preparation import free_slots, pinned_viewpoints
 
 RARELY_SEEN = 0.05
 
@@ -34,6 +35,9 @@ def check_study(path: Path, progress: Progress = silent) -> Findings:
     """
     task = load_task(path)
     named_ends(task)
+    free_slots(task)
+    if task.study.motion != "workspace":
+        pinned_viewpoints(task)
     progress("check", 1, 3, "visibility")
     seen = coverage(task)
     progress("check", 2, 3, "robot")

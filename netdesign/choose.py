@@ -136,7 +136,7 @@ def choose(
     answer = design.get("answer")
     if not asked_here and answer is not None and not answer["met"]:
         raise InfeasibleError(answer["reason"])
-    met = decide.admissible(requirements, len(networks))
+    met = decide.admissible(requirements, objectives[:, 2])
     by_knee = knee or not requirements
     index = _knee(design, met) if by_knee else decide.cheapest(objectives, met)
     rows = front_rows(run)

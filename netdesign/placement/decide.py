@@ -80,26 +80,28 @@ def cheapest(objectives: Floats, admissible: Bools) -> int:
     return int(order[admissible[order]][0])
 
 
-def admissible(requirements: list[Requirement], count: int) -> Bools:
-    """Return (count,) which networks meet every requirement.
+def admissible(requirements: list[Requirement], images: Floats) -> Bools:
+    """Return (p,) which networks, of ``images`` (p,) each, meet every requirement.
 
     Raises:
         InfeasibleError: none does; names the requirement that binds and the best value that can be had.
     """
-    met = np.ones(count, dtype=bool)
+    met = np.ones(len(images), dtype=bool)
     for requirement in requirements:
         met &= requirement.met
     if not met.any():
-        raise InfeasibleError(binding(requirements, count))
+        raise InfeasibleError(binding(requirements, images))
     return met
 
 
-def binding(requirements: list[Requirement], count: int) -> str:
-    """Return in words why no network meets all requirements, and what would."""
+def binding(requirements: list[Requirement], images: Floats) -> str:
+    """Return in words why no network, of ``images`` (p,) each, meets all requirements, and what would."""
+    count = len(images)
     alone = [requirement for requirement in requirements if not requirement.met.any()]
     if alone:
         return f"none of the {count} networks of the front has a " + "; nor a ".join(
-            f"{requirement}: the best has {_best(requirement.values, requirement.unit)}" for requirement in alone
+            f"{requirement}: the best has {_best(requirement.values, requirement.unit)}{_enough(requirement, images)}"
+            for requirement in alone
         )
     # Each can be met, not all together: what would each have to give way to when the others stand?
     ways = []
@@ -115,6 +117,15 @@ def binding(requirements: list[Requirement], count: int) -> str:
     counts = ", ".join(f"{int(requirement.met.sum())} have the {requirement.name}" for requirement in requirements)
     relief = f"; it can be had with {' or '.join(ways)}" if ways else "; more than one of them has to give way"
     return f"none of the {count} networks of the front has a {together} together ({counts}){relief}"
+
+
+def _enough(requirement: Requirement, images: Floats) -> str:
+    """Return about how many images a sigma needs: it falls with the square root of their number."""
+    best = int(np.argmin(requirement.values))
+    if requirement.unit != "µm" or not np.isfinite(requirement.values[best]):
+        return ""
+    needed = math.ceil(images[best] * (requirement.values[best] / requirement.limit) ** 2)
+    return f" with {int(images[best])} images, about {needed} would be needed"
 
 
 def _best(values: Floats, unit: str) -> str:

@@ -155,10 +155,11 @@ class FreeProblem(NetworkProblem):
                 best = int(rows[np.argmin(values[rows])])
                 if values[best] < value[member]:
                     value[member], here[member] = values[best], trials[best]
-        least = 1 if self.fixed else 2
+        least = max(0, 2 - len(self.fixed))
         changed = []
         for network in here:
-            changed += [np.delete(network, rng.integers(len(network)), axis=0) for _ in range(REMOVALS)]
+            for _ in range(REMOVALS if len(network) else 0):
+                changed.append(np.delete(network, rng.integers(len(network)), axis=0))
             new = self.chromosomes.uniform(rng, (ADDITIONS,))
             changed += [np.concatenate([network, station[None]]) for station in new]
         changed = [network for network in changed if least <= len(network) <= slots]
@@ -169,6 +170,8 @@ class FreeProblem(NetworkProblem):
 
     def _moved(self, rng: np.random.Generator, network: Floats) -> Floats:
         """One station of a network (k, d) nudged or sent anywhere."""
+        if not len(network):
+            return network
         moved, camera = network.copy(), rng.integers(len(network))
         anywhere = rng.random() < TELEPORTS
         moved[camera] = self.chromosomes.uniform(rng, ()) if anywhere else self.chromosomes.nudged(rng, network[camera])
@@ -183,11 +186,11 @@ class FreeProblem(NetworkProblem):
             own = [next(stations) for _ in range(int(chosen.sum()))]
             network = [*self.fixed, *own]
             objectives[row, 2] = len(network)
-            if not own:
+            if len(network) < 2:
                 violation[row] = 1e3
                 continue
             rays = np.sum([station.sees for station in network], axis=0)
-            seen = np.array([station.sees.sum() for station in own])
+            seen = np.array([station.sees.sum() for station in own], np.int64)
             lacking = np.maximum(limits.min_rays - rays, 0).sum() + np.maximum(1 - seen / self.min_tags, 0).sum()
             lacking += (~constraint[row][chosen]).sum()
             if lacking > 0:

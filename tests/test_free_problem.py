@@ -210,6 +210,27 @@ def test_existing_stations_that_leave_no_room_or_do_not_fit_are_refused():
         Problem.build(replace(task, existing=off_sphere(2)))
 
 
+@pytest.mark.parametrize("fast", [True, False])
+def test_requirements_with_existing_stations(fast):
+    """What the existing stations need beside them: nothing, a few images, or more than are allowed."""
+    task = task_of(plate_scene(side=3), max_images=7)
+    given = task.sphere.cameras(np.array([[0.3, 0.8], [2.4, 0.8], [-1.8, 0.8]])) if fast else off_sphere(3)
+    sizes = []
+    for limit in (60.0, 10.0, 5.0):
+        asked = task_of(plate_scene(side=3), max_images=7, requirements={"max_sigma_um": limit})
+        problem = problem_of(replace(asked, existing=given))
+        assert isinstance(problem, Problem) == fast
+        design = finish(problem, run(problem, "memetic", 20, 20, 1))
+        if design.answer is None:
+            assert "with 7 images" in design.answer_reason
+            continue
+        sizes.append(design.networks[design.answer].f3)
+        assert design.networks[design.answer].precision.sigma.max() <= 1e-6 * limit
+    assert sizes[0] == 3
+    assert 3 < sizes[1] <= 7
+    assert len(sizes) == 2
+
+
 def test_requirements_are_met_beyond_the_sphere():
     task = free_task(SHELL, max_images=8, requirements={"max_sigma_um": 9.0})
     problem = problem_of(task)

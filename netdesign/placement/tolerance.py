@@ -151,7 +151,7 @@ def climb(problem: NetworkProblem, load: Load, viewpoints: Floats, rounds: int =
     share = load.used(viewpoints)
     rng = np.random.default_rng([problem.task.study.seed, len(viewpoints), 1])
     for _ in range(rounds):
-        if share <= SAFE:
+        if share <= SAFE or not len(viewpoints):  # met, or existing stations only
             break
         trials, _, violation = _neighbours(problem, rng, viewpoints)
         for row in np.flatnonzero(violation <= 0).tolist():
@@ -165,7 +165,7 @@ def shorten(problem: NetworkProblem, load: Load, viewpoints: Floats) -> Floats:
     """Move single cameras of an admissible network (k, 2) while the tour becomes shorter and everything stays met."""
     tour = _tour(problem, viewpoints)
     rng = np.random.default_rng([problem.task.study.seed, len(viewpoints), 2])
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if len(viewpoints) else 0):
         trials, length, violation = _neighbours(problem, rng, viewpoints)
         for row in np.argsort(length, kind="stable").tolist():
             if violation[row] <= 0 and length[row] < tour and load.used(trials[row]) <= SAFE:

@@ -15,6 +15,7 @@ from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.visibility import Sight, sightings
 from netdesign.placement import bound
 from netdesign.placement.bound import lower_bounds
+from netdesign.placement.optimal_design import optimal_weights
 from netdesign.placement.problem import Problem
 from netdesign.placement.visibility_map import VisibilityMap
 from netdesign.search.engine import run
@@ -236,3 +237,19 @@ def test_nothing_is_claimed_where_nothing_is_proved():
     assert lower_bounds(make_task(plate, propagation="total"), [8], grid_map) == {}
     below = make_task(plate, stations=sphere(elevation=(-80, -40)))
     assert lower_bounds(below, [8], VisibilityMap.build(plate, CAMERA, below.sphere, LIMITS, step=STEP)) == {}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_point_that_one_candidate_sees_does_not_break_the_optimum(seed):
+    """As with an arm of short reach: a point without depth must not turn a height negative by rounding."""
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(200, 12, 3))
+    directions[:, 0] = [0.3, -0.2, 0.9] + 1e-5 * rng.normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+    matrices = 1e8 * (np.eye(3) - directions[..., :, None] * directions[..., None, :])
+    matrices[1:, 0] = 0.0
+    flat = matrices[:, :, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].reshape(200, -1)
+    _, weights = optimal_weights(flat, np.full(200, 1 / 200))
+    assert np.isfinite(weights).all()
+    assert (weights >= 0).all()
+    assert weights.sum() == pytest.approx(1.0)

@@ -36,7 +36,8 @@ def optimal_weights(flat: Floats, weights: Floats) -> tuple[Ints, Floats]:
     for iteration in range(ITERATIONS):
         inverse = inverses(flat, weights)
         square = (inverse @ inverse)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]] * [1.0, 2, 2, 1, 2, 1]
-        height = flat @ square.ravel()
+        # Never negative but for rounding, where a point has nearly parallel rays only.
+        height = np.maximum(flat @ square.ravel(), 0.0)
         mean = float(weights @ height)
         if height.max() <= (1.0 + TOLERANCE) * mean:
             break
@@ -52,8 +53,8 @@ def inverses(flat: Floats, weights: Floats) -> Floats:
     """Return (m, 3, 3) inverses of Σ_i w_i M_ij for flattened matrices (c, 6 m): xx xy xz yy yz zz of every point."""
     summed = (weights @ flat).reshape(-1, 6)
     normal = summed[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-    # A point with nearly parallel rays only: its inverse need not be exact.
-    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    # A point with nearly parallel rays only: its inverse need not be exact, but its square must not drown in rounding.
+    normal += 1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     return np.asarray(np.linalg.inv(normal), dtype=np.float64)
 
 

@@ -29,7 +29,7 @@ from netdesign.run_folder import open_run
 
 UM = 1e-6
 TRIANGLES = 20000  # of the part as it is drawn
-THUMBNAILS = 4
+THUMBNAILS = 4  # of a network; the recommended one shows every station
 REACH_SAMPLES = 4000
 SCREEN_WIDTH, PAPER_DPI = 1100, 170  # px, dots per inch
 
@@ -94,21 +94,21 @@ def read_run(run: Path) -> RunRecord:
     """
     task, design = open_run(run), read_design(run)
     sight = Sight(task.scene, task.camera, task.limits)
-    networks = tuple(_network(run, task, sight, entry) for entry in design["networks"])
-    network, reason = _recommended(run)
+    recommended, reason = _recommended(run)
+    networks = tuple(_network(run, task, sight, entry, recommended) for entry in design["networks"])
     return RunRecord(
         task=task,
         design=design,
         networks=networks,
         campaign=_optional(run / "validation.json", "validation"),
-        knee=network,
+        knee=recommended,
         reason=reason,
         arm=None if task.cell is None else Arm.of(task.cell, load_chain(task.cell)),
         recomputed=max(_difference(network) for network in networks),
     )
 
 
-def _network(run: Path, task: Task, sight: Sight, entry: dict[str, Any]) -> NetworkRecord:
+def _network(run: Path, task: Task, sight: Sight, entry: dict[str, Any], recommended: int) -> NetworkRecord:
     poses = poses_of(entry)
     seen = sight.look(poses)
     total = network_total_error(task, poses, seen.visible)
@@ -127,7 +127,7 @@ def _network(run: Path, task: Task, sight: Sight, entry: dict[str, Any]) -> Netw
         repeats=tuple(
             read_json(path, "network-validation") for path in sorted(folder.glob("repeat-*/validation.json"))
         ),
-        thumbnails=_thumbnails(folder),
+        thumbnails=_thumbnails(folder, everything=entry["id"] == recommended),
         adjustment=_optional(folder / "adjustment.json", "adjustment"),
     )
 
@@ -145,10 +145,11 @@ def _without(task: Task, poses: Floats, visible: Bools) -> Floats:
     return np.array(found)
 
 
-def _thumbnails(folder: Path) -> tuple[tuple[str, bytes], ...]:
-    """Return a few images of a network, spread over its tour, as small JPEGs; none before it is rendered."""
+def _thumbnails(folder: Path, everything: bool) -> tuple[tuple[str, bytes], ...]:
+    """Return images of a network, all or a few spread over its tour, as small JPEGs; none before it is rendered."""
     paths = sorted((folder / "images").glob("*.png"))
-    chosen = sorted({round(index) for index in np.linspace(0, len(paths) - 1, min(len(paths), THUMBNAILS))})
+    count = len(paths) if everything else min(len(paths), THUMBNAILS)
+    chosen = sorted({round(index) for index in np.linspace(0, len(paths) - 1, count)})
     return tuple((f"station {index + 1}", thumbnail(paths[index])) for index in chosen)
 
 

@@ -73,7 +73,7 @@ def finish(problem: NetworkProblem, state: State, progress: Progress = silent) -
     dropped["dominated once computed exactly"] += len(networks) - len(kept)
     place = None if best is None else len(networks) - 1
     rest = kept[kept != place]
-    kept = rest[spread(objectives[rest], max(1, most - (place is not None)))]
+    kept = rest[spread(objectives[rest], most - (place is not None))]
     kept = kept if place is None else np.append(kept, place)
     kept = kept[np.lexsort((objectives[kept, 1], objectives[kept, 0], objectives[kept, 2]))]
     bounds = problem.bounds(sorted({networks[row].f3 for row in kept}))
@@ -182,8 +182,8 @@ def spread(objectives: Floats, most: int) -> Ints:
     shortest tour, then always the network farthest from the chosen ones in log f1, f2 and f3, scaled to their ranges.
     Networks of more than COARSE times the smallest f1 buy a short tour with next to no precision: they come last.
     """
-    if len(objectives) <= most:
-        return np.arange(len(objectives))
+    if len(objectives) <= most or most <= 0:
+        return np.arange(min(len(objectives), max(most, 0)))
     f1, f2, f3 = np.maximum(objectives.T, 1e-300)
     sizes = np.unique(f3)
     sizes = sizes[np.unique(np.round(np.linspace(0, len(sizes) - 1, min(most, len(sizes)))).astype(np.int64))]

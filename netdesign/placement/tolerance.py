@@ -97,9 +97,23 @@ class Load:
         u95 = distance_u95(self.problem.task, network.world_from_cam, self.ends) if len(self.ends) else np.zeros(0)
         return u95 if len(self.names) == len(self.ends) else np.append(network.precision.sigma.max(), u95)
 
+    def shares(self, viewpoints: Floats) -> Floats:
+        """Return (r,) how much of each requirement a network (k, 2) uses up, estimated and scaled."""
+        return np.asarray(self.scale * self.estimated(viewpoints) / self.limits)
+
     def used(self, viewpoints: Floats) -> float:
-        """Return the largest share of a requirement that a network (k, 2) uses up, estimated and scaled."""
-        return float((self.scale * self.estimated(viewpoints) / self.limits).max())
+        """Return the largest share of a requirement that a network (k, 2) uses up."""
+        return float(self.shares(viewpoints).max())
+
+    def alone(self, row: int) -> Callable[[Floats], float]:
+        """Return the share of one requirement as a function of the network, above 10 where another one is not kept."""
+
+        def used(viewpoints: Floats) -> float:
+            shares = self.shares(viewpoints)
+            others = float(np.delete(shares, row).max(initial=0.0))
+            return float(shares[row]) if others <= 1.0 else 10.0 + others
+
+        return used
 
 
 def cheapest_admissible(problem: NetworkProblem, members: Population, exactly: Exactly) -> Answer | None:
@@ -125,7 +139,7 @@ def cheapest_admissible(problem: NetworkProblem, members: Population, exactly: E
         if shares[best] > NEAR and not last:
             continue
         for _ in range(TRIALS):
-            viewpoints = climb(problem, load, starts[best])
+            viewpoints = climb(problem, load.used, starts[best])
             share = load.used(viewpoints)
             if share < nearest[0]:
                 nearest = share, viewpoints
@@ -146,16 +160,16 @@ def cheapest_admissible(problem: NetworkProblem, members: Population, exactly: E
     return Answer(network=None, reason=_unmet(problem, load, nearest[1], exactly))
 
 
-def climb(problem: NetworkProblem, load: Load, viewpoints: Floats, rounds: int = ROUNDS) -> Floats:
-    """Move single cameras of a network (k, 2) while the largest share falls; stop once everything is met."""
-    share = load.used(viewpoints)
+def climb(problem: NetworkProblem, used: Callable[[Floats], float], viewpoints: Floats, rounds: int = ROUNDS) -> Floats:
+    """Move single cameras of a network (k, 2) while the share ``used`` falls; stop once it is met."""
+    share = used(viewpoints)
     rng = np.random.default_rng([problem.task.study.seed, len(viewpoints), 1])
     for _ in range(rounds):
         if share <= SAFE or not len(viewpoints):  # met, or existing stations only
             break
         trials, _, violation = _neighbours(problem, rng, viewpoints)
         for row in np.flatnonzero(violation <= 0).tolist():
-            value = load.used(trials[row])
+            value = used(trials[row])
             if value < share:
                 share, viewpoints = value, trials[row]
     return viewpoints
@@ -201,20 +215,24 @@ def _unmet(problem: NetworkProblem, load: Load, viewpoints: Floats, exactly: Exa
     """Return which requirement binds, the best that can be had, and what would satisfy it."""
     found = exactly(viewpoints)
     values = load.scale * load.estimated(viewpoints) if isinstance(found, str) else load.exact(found)
-    over = values > load.limits
-    if not over.any():
-        over = values >= (values / load.limits).max() * load.limits
     fixed = len(problem.task.existing)
     size = fixed + len(viewpoints)
-    parts = [
-        f"{load.names[row]} is at best {round_up(1e6 * values[row]):g} µm (required {1e6 * load.limits[row]:g})"
-        for row in np.flatnonzero(over).tolist()
-    ]
+    best = _each_alone(problem, load, viewpoints) if len(load.names) > 1 else {}
+    lead = "with the others kept, " if best else ("together, " if len(load.names) > 1 else "")
+    if not best:
+        over = values > load.limits
+        best = (
+            dict(enumerate(values)) if not over.any() else {row: values[row] for row in np.flatnonzero(over).tolist()}
+        )
+    parts = lead + (" or " if lead.startswith("with") else " and ").join(
+        f"{load.names[row]} is at best {round_up(1e6 * value):g} µm (required {1e6 * load.limits[row]:g})"
+        for row, value in best.items()
+    )
     free = problem.without_tour_limit()
     easier = replace(load, problem=free, scale=np.maximum(load.scale, values / load.estimated(viewpoints)))
     ways = []
     if free is not problem:
-        longer = climb(free, easier, viewpoints)
+        longer = climb(free, easier.used, viewpoints)
         if easier.used(longer) <= 1.0:
             ways.append(f"a tour of {_length(free, longer)} would reach it")
     enough = None if ways else _enlarged(free, easier, viewpoints)
@@ -223,20 +241,40 @@ def _unmet(problem: NetworkProblem, load: Load, viewpoints: Floats, exactly: Exa
     elif not ways:
         ways.append(f"{MOST_IMAGES} images would not reach it")
     within = " within requirements.max_tour" if free is not problem else ""
-    return f"no network meets the requirements: {' and '.join(parts)}{within} with {size} images; {' or '.join(ways)}"
+    return f"no network meets the requirements: {parts}{within} with {size} images; {' or '.join(ways)}"
+
+
+def _each_alone(problem: NetworkProblem, load: Load, viewpoints: Floats) -> dict[int, float]:
+    """Return for each requirement the best value (m) found with all others kept; only those that exceed it then."""
+    found = {}
+    for row in range(len(load.names)):
+        used = load.alone(row)
+        share = used(climb(problem, used, viewpoints))
+        if 1.0 < share < 10.0:
+            found[row] = share * float(load.limits[row])
+    return found
 
 
 def _enlarged(problem: NetworkProblem, load: Load, viewpoints: Floats) -> Floats | None:
-    """The network with images added, each where it serves best, until the requirements are met; None if never."""
+    """The network with images added until the requirements are met; None if never.
+
+    Sigmas fall with the square root of the number of images: up to nine tenths of what that says images are added by f1
+    alone, from there on each where it lowers the largest share, and the network is climbed.
+    """
     stations = problem.candidates()
     stations = stations[:: max(1, len(stations) // 60)]
-    while len(problem.task.existing) + len(viewpoints) < MOST_IMAGES:
+    fixed = len(problem.task.existing)
+    likely = 0.9 * (fixed + len(viewpoints)) * load.used(viewpoints) ** 2
+    while fixed + len(viewpoints) < MOST_IMAGES:
         trials = np.concatenate([np.tile(viewpoints, (len(stations), 1, 1)), stations[:, None]], axis=1)
-        viewpoints = trials[int(np.argmin([load.used(trial) for trial in trials]))]
-        if load.used(viewpoints) < 1.05:
-            viewpoints = climb(problem, load, viewpoints, ROUNDS // 4)
-        if load.used(viewpoints) <= 1.0:
-            return viewpoints
+        f1, violation = problem.limited_scores(np.ones(trials.shape[:2], np.bool_), trials)
+        near = fixed + len(viewpoints) + 1 >= likely
+        shares = np.round([load.used(trial) for trial in trials], 3) if near else np.zeros(len(trials))
+        viewpoints = trials[int(np.lexsort((f1, shares, violation))[0])]
+        if near:
+            viewpoints = climb(problem, load.used, viewpoints, ROUNDS // 2)
+            if load.used(viewpoints) <= 1.0:
+                return viewpoints
     return None
 
 

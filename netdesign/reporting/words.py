@@ -104,9 +104,11 @@ def verdict(record: RunRecord) -> str:
     counts = Counter(network.verdict for network in record.networks)
     total = len(record.networks)
     proved, failed = counts["pass"], total - counts["pass"] - counts["not validated"]
+    fixed = len(record.task.existing)
+    existing = f" and from {fixed} existing stations" if fixed else ""
     part = (
         f"For “{record.task.study.name}”: {len(record.task.scene.targets.ids)} tags on the part, "
-        f"seen from a {stations(record.task.study.viewpoints)}. "
+        f"seen from a {stations(record.task.study.viewpoints)}{existing}. "
     )
     if proved + failed == 0:
         return part + "Designed, not proved yet: every sigma below is a prediction."

@@ -18,6 +18,7 @@ WEAK_DEPTH = 0.01  # sigma over distance above which its ray geometry is named
 HARDLY_CHECKED = 0.1  # redundancy number below which a gross error hardly shows in the residual
 SHARE_HARDLY_CHECKED = 0.05  # of the image points; a few at the end of a three-ray point are in every network
 CLOSE_BASELINE = 0.01
+MOST_GROUPS = 3  # of loosely tied images that are named; a project of a hundred images has many
 CORRELATION = 0.95
 # Effects of a parameter's sigma in the image. That it is large is a warning; that it moves the edge of the field by a
 # tenth of its radius is no estimate any more. A flat object seen without roll is singular for the principal point,
@@ -236,7 +237,10 @@ def quality_warnings(
     if low.mean() > SHARE_HARDLY_CHECKED:
         share = f"{int(low.sum())} of {len(low)} image points have a redundancy number below {HARDLY_CHECKED}"
         warnings.append(f"{share}: a gross error in them would hardly show")
-    warnings.extend(tie_flags(problem.visible(), problem.image_names) if not problem.known().any() else ())
+    flags = tie_flags(problem.visible(), problem.image_names) if not problem.known().any() else ()
+    warnings.extend(flags[:MOST_GROUPS])
+    if len(flags) > MOST_GROUPS:
+        warnings.append(f"{len(flags) - MOST_GROUPS} more groups of images hang on the rest by few points")
     warnings.extend(_variance_warning(adjustment))
     warnings.extend(_weak_parameters(problem, adjustment))
     warnings.extend(_correlations(problem, adjustment))

@@ -66,6 +66,7 @@ def test_what_is_said_to_be_enough_is_enough(asked):
     required = float(re.search(r"required ([\d.]+)\) with 5 images", design.answer_reason)[1])
     assert best > required
     enough = int(re.search(r"(\d+) images would reach it", design.answer_reason)[1])
+    assert enough > 5
     _, larger = designed(max_images=enough, **asked)
     assert larger.answer is not None
     assert larger.networks[larger.answer].f3 <= enough
@@ -83,6 +84,11 @@ def test_a_tour_limit_that_cannot_be_kept_names_the_tour_that_can():
     problem = Problem.build(task_of(plate_scene(side=3), max_images=4, requirements={"max_tour": 1e-3}))
     with pytest.raises(InfeasibleError, match=r"the shortest one found takes [\d.]+ mm"):
         finish(problem, run(problem, "memetic", 8, 4, 1))
+
+
+def test_more_images_are_promised_beyond_a_tour_limit_too():
+    _, design = designed(max_images=5, max_sigma_um=7.0, max_tour=700.0)
+    assert re.search(r"within requirements.max_tour with \d images; \d+ images would reach it", design.answer_reason)
 
 
 def test_choose_repeats_the_reason(tmp_path):

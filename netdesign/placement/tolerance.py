@@ -127,6 +127,7 @@ def cheapest_admissible(problem: NetworkProblem, members: Population, exactly: E
         return None
     sizes = members.objectives[:, 2].astype(int)
     nearest: tuple[float, Floats] | None = None
+    climbed: list[Floats] = []
     for size in np.unique(sizes).tolist():
         layer = members.take(sizes == size)
         rows = np.unique(np.round(np.linspace(0, len(layer) - 1, min(len(layer), 40))).astype(int))
@@ -140,6 +141,7 @@ def cheapest_admissible(problem: NetworkProblem, members: Population, exactly: E
             continue
         for _ in range(TRIALS):
             viewpoints = climb(problem, load.used, starts[best])
+            climbed.append(viewpoints)
             share = load.used(viewpoints)
             if share < nearest[0]:
                 nearest = share, viewpoints
@@ -157,6 +159,10 @@ def cheapest_admissible(problem: NetworkProblem, members: Population, exactly: E
             shares = np.array([load.used(start) for start in starts])
             best = int(shares.argmin())
     assert nearest is not None
+    for start in climbed[-2:-6:-2]:  # a smaller network enlarged may end where the climb of a large one does not
+        enlarged = _enlarged(problem, load, start, int(sizes.max()), exactly)
+        if enlarged is not None and enlarged[1] is not None:
+            return Answer(network=enlarged[1], reason=_met(load, load.exact(enlarged[1])))
     return Answer(network=None, reason=_unmet(problem, load, nearest[1], exactly))
 
 
@@ -235,9 +241,10 @@ def _unmet(problem: NetworkProblem, load: Load, viewpoints: Floats, exactly: Exa
         longer = climb(free, easier.used, viewpoints)
         if easier.used(longer) <= 1.0:
             ways.append(f"a tour of {_length(free, longer)} would reach it")
-    enough = None if ways else _enlarged(free, easier, viewpoints)
+    checked = exactly if free is problem else None  # the exact check keeps the tour's limit
+    enough = None if ways else _enlarged(free, easier, viewpoints, MOST_IMAGES, checked)
     if enough is not None:
-        ways.append(f"{fixed + len(enough)} images would reach it, on a tour of {_length(free, enough)}")
+        ways.append(f"{fixed + len(enough[0])} images would reach it, on a tour of {_length(free, enough[0])}")
     elif not ways:
         ways.append(f"{MOST_IMAGES} images would not reach it")
     within = " within requirements.max_tour" if free is not problem else ""
@@ -255,17 +262,18 @@ def _each_alone(problem: NetworkProblem, load: Load, viewpoints: Floats) -> dict
     return found
 
 
-def _enlarged(problem: NetworkProblem, load: Load, viewpoints: Floats) -> Floats | None:
-    """The network with images added until the requirements are met; None if never.
+def _enlarged(
+    problem: NetworkProblem, load: Load, viewpoints: Floats, most: int, exactly: Exactly | None
+) -> tuple[Floats, DesignedNetwork | None] | None:
+    """The network with up to ``most`` images that meets the requirements; None when that is not enough.
 
-    Sigmas fall with the square root of the number of images: up to nine tenths of what that says images are added by f1
-    alone, from there on each where it lowers the largest share, and the network is climbed.
+    Up to 0.9 of what the square-root law asks for, images are added by f1; then where they lower the largest share.
     """
     stations = problem.candidates()
     stations = stations[:: max(1, len(stations) // 60)]
     fixed = len(problem.task.existing)
-    likely = 0.9 * (fixed + len(viewpoints)) * load.used(viewpoints) ** 2
-    while fixed + len(viewpoints) < MOST_IMAGES:
+    likely = min(most, 0.9 * (fixed + len(viewpoints)) * load.used(viewpoints) ** 2)
+    while fixed + len(viewpoints) < most:
         trials = np.concatenate([np.tile(viewpoints, (len(stations), 1, 1)), stations[:, None]], axis=1)
         f1, violation = problem.limited_scores(np.ones(trials.shape[:2], np.bool_), trials)
         near = fixed + len(viewpoints) + 1 >= likely
@@ -273,8 +281,17 @@ def _enlarged(problem: NetworkProblem, load: Load, viewpoints: Floats) -> Floats
         viewpoints = trials[int(np.lexsort((f1, shares, violation))[0])]
         if near:
             viewpoints = climb(problem, load.used, viewpoints, ROUNDS // 2)
-            if load.used(viewpoints) <= 1.0:
-                return viewpoints
+            if load.used(viewpoints) > 1.0:
+                continue
+            if exactly is None:
+                return viewpoints, None
+            found = exactly(viewpoints)
+            if isinstance(found, str):
+                continue
+            values = load.exact(found)
+            if (values <= load.limits).all():
+                return viewpoints, found
+            load = replace(load, scale=np.maximum(load.scale, values / load.estimated(viewpoints)) * (1 + 1e-6))
     return None
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from netdesign.search.population import Floats, Ints, Population, joined
+from netdesign.search.selection import first_of_runs
 
 EPSILON = 0.01
 """Relative width of a box in either objective; without thinning an archive fills up with near-copies."""
@@ -57,23 +58,23 @@ def staircases(objectives: Floats, epsilon: float) -> Ints:
     logs = np.log(np.maximum(objectives[:, :2], 1e-300))
     order = np.lexsort((objectives[:, 1], objectives[:, 0], objectives[:, 2]))
     size, second = objectives[order, 2], objectives[order, 1]
-    starts = np.r_[True, size[1:] != size[:-1]]
+    starts, ends = first_of_runs(size)
     layer = np.cumsum(starts) - 1
     keep = np.ones(len(order), dtype=np.bool_)
-    for first, last in zip(np.flatnonzero(starts), np.r_[np.flatnonzero(starts)[1:], len(order)], strict=True):
-        lowest = np.minimum.accumulate(second[first:last])
-        keep[first + 1 : last] = second[first + 1 : last] < lowest[:-1]
+    for first, last in zip(np.flatnonzero(starts).tolist(), np.flatnonzero(ends).tolist(), strict=True):
+        lowest = np.minimum.accumulate(second[first : last + 1])
+        keep[first + 1 : last + 1] = second[first + 1 : last + 1] < lowest[:-1]
     order, layer = order[keep], layer[keep]
     if epsilon <= 0:
         return order
     boxes = np.floor(logs[order] / np.log1p(epsilon)).astype(np.int64)
     nearness = logs[order].sum(axis=1)
-    same = np.r_[False, (layer[1:] == layer[:-1]) & (boxes[1:] == boxes[:-1]).all(axis=1)]
-    box = np.cumsum(~same) - 1
-    best = np.lexsort((np.arange(len(order)), nearness, box))
-    chosen = np.zeros(len(order), dtype=np.bool_)
-    chosen[best[np.r_[True, box[best][1:] != box[best][:-1]]]] = True
-    chosen |= np.r_[True, layer[1:] != layer[:-1]] | np.r_[layer[1:] != layer[:-1], True]
+    starts, ends = first_of_runs(layer)
+    chosen = starts | ends
+    starts[1:] |= (boxes[1:, 0] != boxes[:-1, 0]) | (boxes[1:, 1] != boxes[:-1, 1])
+    box = np.cumsum(starts) - 1
+    best = np.lexsort((nearness, box))
+    chosen[best[first_of_runs(box[best])[0]]] = True
     return order[chosen]
 
 

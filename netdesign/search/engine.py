@@ -18,7 +18,7 @@ import numpy as np
 from netdesign.errors import InputError
 from netdesign.search.archive import empty_archive
 from netdesign.search.population import Floats, Ints, Population, SearchProblem, Vary, evaluated, joined
-from netdesign.search.selection import constrained_ranks, crowding, survive, tournament
+from netdesign.search.selection import ranked, survive, tournament
 from netdesign.search.state import State, generator_state, restored_generator
 
 Engine = Literal["memetic", "nsga2"]
@@ -67,9 +67,11 @@ def start(problem: SearchProblem, engine: Engine, population: int, seed: int) ->
         raise InputError(f"engine: expected memetic or nsga2, found {engine}")
     first = evaluated(problem.evaluate, bits, genes)
     archive = empty_archive(bits.shape[1], genes.shape[2], first.objectives.shape[1]).with_rows(first)
+    ranks, crowding = ranked(first)
     empty = State(
-        step=0, population=first, archive=archive, evaluations=np.zeros(0, np.int64), hypervolume=np.zeros(0), random=""
-    )
+        step=0, population=first, ranks=ranks, crowding=crowding, archive=archive, evaluations=np.zeros(0, np.int64),
+        hypervolume=np.zeros(0), random="",
+    )  # fmt: skip
     return _noted(problem, empty, rng, len(first))
 
 
@@ -82,9 +84,10 @@ def steps(problem: SearchProblem, engine: Engine, state: State, population: int,
     while state.evaluations[-1] < budget:
         # Without a feasible network there is nothing to improve: go on breeding.
         if state.step < genetic or len(state.archive) == 0:
-            children = offspring(rng, problem, state.population, vary)
-            survivors = survive(joined([state.population, children]), population)[0]
-            state = replace(state, population=survivors, archive=state.archive.with_rows(children))
+            children = offspring(rng, problem, state.population, state.ranks, state.crowding, vary)
+            survivors, ranks, crowding = survive(joined([state.population, children]), population)
+            archive = state.archive.with_rows(children)
+            state = replace(state, population=survivors, ranks=ranks, crowding=crowding, archive=archive)
         else:
             children = problem.improve(rng, _picks(rng, state))
             state = replace(state, archive=state.archive.with_rows(children))
@@ -92,11 +95,11 @@ def steps(problem: SearchProblem, engine: Engine, state: State, population: int,
         yield state
 
 
-def offspring(rng: np.random.Generator, problem: SearchProblem, population: Population, vary: Vary) -> Population:
-    """Return as many evaluated children as there are parents."""
-    ranks = constrained_ranks(population.objectives, population.violation)
-    readable = np.where((population.violation <= 0)[:, None], population.objectives, 0.0)
-    parents = tournament(rng, ranks, crowding(readable, ranks), len(population) + len(population) % 2)
+def offspring(
+    rng: np.random.Generator, problem: SearchProblem, population: Population, ranks: Ints, crowding: Floats, vary: Vary
+) -> Population:
+    """Return as many evaluated children as there are parents, which win tournaments by rank and crowding (P,)."""
+    parents = tournament(rng, ranks, crowding, len(population) + len(population) % 2)
     half = len(parents) // 2
     bits, genes = vary(rng, population.take(parents[:half]), population.take(parents[half:]))
     return evaluated(problem.evaluate, bits, genes)

@@ -31,21 +31,26 @@ def sbx(
     """
     crossed = (rng.random((len(first), 1)) < probability) & (rng.random(first.shape) < 0.5)
     draw, swap = rng.random(first.shape), rng.random(first.shape) < 0.5
-    low, high = np.minimum(first, second), np.maximum(first, second)
+    crossed &= np.abs(second - first) > 1e-14
+    children = np.concatenate([first, second])
+    where = np.flatnonzero(crossed)  # powers are dear: only where they are needed
+    mother, father, draw, swap = first.ravel()[where], second.ravel()[where], draw.ravel()[where], swap.ravel()[where]
+    variable = where % first.shape[1]
+    lower, upper = np.broadcast_to(lower, first.shape[1])[variable], np.broadcast_to(upper, first.shape[1])[variable]
+    low, high = np.minimum(mother, father), np.maximum(mother, father)
     distance = high - low
-    crossed &= distance > 1e-14
-    safe = np.where(distance > 1e-14, distance, 1.0)
 
     def spread(room: Floats) -> Floats:
-        alpha = 2.0 - (1.0 + 2.0 * room / safe) ** -(eta + 1.0)
+        alpha = 2.0 - (1.0 + 2.0 * room / distance) ** -(eta + 1.0)
         inside = draw <= 1.0 / alpha
         base = np.where(inside, draw * alpha, 1.0 / np.maximum(2.0 - draw * alpha, 1e-300))
         return np.asarray(base ** (1.0 / (eta + 1.0)))
 
     one = np.clip(0.5 * (low + high - spread(low - lower) * distance), lower, upper)
     two = np.clip(0.5 * (low + high + spread(upper - high) * distance), lower, upper)
-    one, two = np.where(swap, two, one), np.where(swap, one, two)
-    return np.concatenate([np.where(crossed, one, first), np.where(crossed, two, second)])
+    flat = children.reshape(-1)
+    flat[where], flat[where + first.size] = np.where(swap, two, one), np.where(swap, one, two)
+    return children
 
 
 def polynomial_mutation(
@@ -53,10 +58,14 @@ def polynomial_mutation(
 ) -> Floats:
     """Return values (P, v) within bounds (v,), each mutated with ``probability`` by the polynomial distribution."""
     mutated, draw = rng.random(values.shape) < probability, rng.random(values.shape)
+    where = np.flatnonzero(mutated)
+    variable, old, draw = where % values.shape[1], values.ravel()[where], draw.ravel()[where]
+    lower, upper = np.broadcast_to(lower, values.shape[1])[variable], np.broadcast_to(upper, values.shape[1])[variable]
     width = upper - lower
-    below, above = (values - lower) / width, (upper - values) / width
+    below, above = (old - lower) / width, (upper - old) / width
     power = 1.0 / (eta + 1.0)
     down = (2.0 * draw + (1.0 - 2.0 * draw) * (1.0 - below) ** (eta + 1.0)) ** power - 1.0
     up = 1.0 - (2.0 * (1.0 - draw) + 2.0 * (draw - 0.5) * (1.0 - above) ** (eta + 1.0)) ** power
-    step = np.where(draw < 0.5, down, up) * width
-    return np.where(mutated, np.clip(values + step, lower, upper), values)
+    changed = np.array(values)
+    changed.reshape(-1)[where] = np.clip(old + np.where(draw < 0.5, down, up) * width, lower, upper)
+    return changed

@@ -4,10 +4,13 @@ Source: K. Deb, S. Agrawal, A. Pratap, T. Meyarivan, PPSN VI, 2000, with constra
 feasible before infeasible, feasible by domination, infeasible by violation.
 """
 
+from typing import Any
+
 import moocore
 import numpy as np
+from numpy.typing import NDArray
 
-from netdesign.search.population import Floats, Ints, Population
+from netdesign.search.population import Bools, Floats, Ints, Population
 
 
 def constrained_ranks(objectives: Floats, violation: Floats) -> Ints:
@@ -23,6 +26,14 @@ def constrained_ranks(objectives: Floats, violation: Floats) -> Ints:
     return ranks
 
 
+def first_of_runs(sorted_values: NDArray[Any]) -> tuple[Bools, Bools]:
+    """Return where runs of equal values begin and where they end, (N,) each."""
+    starts, ends = np.ones(len(sorted_values), np.bool_), np.ones(len(sorted_values), np.bool_)
+    np.not_equal(sorted_values[1:], sorted_values[:-1], out=starts[1:])
+    ends[:-1] = starts[1:]
+    return starts, ends
+
+
 def crowding(objectives: Floats, ranks: Ints) -> Floats:
     """Return the crowding distance (P,) of every row within its front; inf at the ends of each objective."""
     count = len(objectives)
@@ -30,8 +41,7 @@ def crowding(objectives: Floats, ranks: Ints) -> Floats:
     for values in objectives.T:
         order = np.lexsort((values, ranks))
         ordered, front = values[order], ranks[order]
-        starts = np.r_[True, front[1:] != front[:-1]]
-        ends = np.r_[starts[1:], True]
+        starts, ends = first_of_runs(front)
         extent = (ordered[np.flatnonzero(ends)] - ordered[np.flatnonzero(starts)])[np.cumsum(starts) - 1]
         gap = np.zeros(count)
         gap[1:-1] = ordered[2:] - ordered[:-2]
@@ -40,12 +50,17 @@ def crowding(objectives: Floats, ranks: Ints) -> Floats:
     return distance
 
 
-def survive(population: Population, size: int) -> tuple[Population, Ints, Floats]:
-    """Return the best ``size`` rows by front, then crowding, with their ranks and crowding distances."""
+def ranked(population: Population) -> tuple[Ints, Floats]:
+    """Return front and crowding distance (P,) of every row."""
     ranks = constrained_ranks(population.objectives, population.violation)
     # Infeasible rows are ordered by violation alone: their objectives mean nothing.
     readable = np.where((population.violation <= 0)[:, None], population.objectives, 0.0)
-    distance = crowding(readable, ranks)
+    return ranks, crowding(readable, ranks)
+
+
+def survive(population: Population, size: int) -> tuple[Population, Ints, Floats]:
+    """Return the best ``size`` rows by front, then crowding, with their ranks and crowding distances."""
+    ranks, distance = ranked(population)
     chosen = np.lexsort((-distance, ranks))[:size]
     return population.take(chosen), ranks[chosen], distance[chosen]
 

@@ -13,7 +13,7 @@ from netdesign.errors import InputError
 from netdesign.search.archive import Archive
 from netdesign.search.population import Floats, Ints, Population
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,13 +22,16 @@ class State:
 
     Attributes:
         step: generations done, those of the local search included.
-        population: the current generation.  archive: the best of every size so far.
+        population: the current generation.  ranks, crowding: (P,) of it, as its survivors were chosen.
+        archive: the best of every size so far.
         evaluations, hypervolume: (h,) history, one entry per step.
         random: state of the random numbers, JSON.
     """
 
     step: int
     population: Population
+    ranks: Ints
+    crowding: Floats
     archive: Archive
     evaluations: Ints
     hypervolume: Floats
@@ -58,6 +61,8 @@ def save(path: Path, state: State, key: str) -> None:
         "version": np.array(VERSION),
         "key": np.array(key),
         "step": np.array(state.step),
+        "ranks": state.ranks,
+        "crowding": state.crowding,
         "evaluations": state.evaluations,
         "hypervolume": state.hypervolume,
         "random": np.array(state.random),
@@ -92,6 +97,8 @@ def load(path: Path, key: str) -> State:
             return State(
                 step=int(stored["step"]),
                 population=populations[0],
+                ranks=stored["ranks"],
+                crowding=stored["crowding"],
                 archive=Archive(members=populations[1]),
                 evaluations=stored["evaluations"],
                 hypervolume=stored["hypervolume"],

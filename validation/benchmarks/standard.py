@@ -11,7 +11,7 @@ from pymoo.problems import get_problem
 from netdesign.search.engine import offspring
 from netdesign.search.operators import polynomial_mutation, sbx
 from netdesign.search.population import Population, evaluated, joined
-from netdesign.search.selection import survive
+from netdesign.search.selection import ranked, survive
 
 # Of the true fronts at reference point 1.1 (reference cases, section 6).
 CLOSED_FORMS = {
@@ -44,9 +44,10 @@ def ours(name: str, seed: int) -> np.ndarray:
     problem, rng = Real(name), np.random.default_rng(seed)
     genes = rng.uniform(problem.inner.xl, problem.inner.xu, (POPULATION, problem.inner.n_var))[..., None]
     population: Population = evaluated(problem.evaluate, np.ones(genes.shape[:2], bool), genes)
+    ranks, crowding = ranked(population)
     for _ in range(GENERATIONS - 1):
-        children = offspring(rng, problem, population, problem.vary_plain)
-        population = survive(joined([population, children]), POPULATION)[0]
+        children = offspring(rng, problem, population, ranks, crowding, problem.vary_plain)
+        population, ranks, crowding = survive(joined([population, children]), POPULATION)
     return population.objectives
 
 

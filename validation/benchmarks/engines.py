@@ -18,6 +18,7 @@ from netdesign.photogrammetry.limited_error import limited_covariance
 from netdesign.placement.problem import Problem
 from netdesign.search.engine import run
 from tests.scenes import CAMERA, LIMITS, box_scene, sphere
+from validation.benchmarks.table import Row
 
 IMAGES, POPULATION = 30, 200
 
@@ -97,28 +98,33 @@ def timed(problem: Problem, engine: str, generations: int, seed: int) -> tuple[f
     return time.process_time() - start, float(state.hypervolume[-1])
 
 
-def lines(long: bool) -> Iterator[str]:
-    """Yield the engine lines; ``long``: 500 generations and five seeds, else 50 and three."""
+def rows(long: bool) -> Iterator[Row]:
+    """Yield the rows of the engines at 200 x 500; ``long``: five seeds and the runs 20 times longer."""
     problem = replace(box_problem(), threads=1)
-    generations, seeds = (500, range(1, 6)) if long else (50, range(1, 4))
+    generations, seeds = 500, range(1, 6) if long else range(1, 4)
     for engine in ("nsga2", "memetic"):
         timed(problem, engine, 3, 0)
     pymoo_seconds(problem, 3, 0)
-    plain = [timed(problem, "nsga2", generations, seed) for seed in seeds]
-    seconds = float(np.median([run_seconds for run_seconds, _ in plain]))
-    ours = f"plain engine, {POPULATION} x {generations}: {seconds:.2f} s of CPU"
-    other = float(np.median([pymoo_seconds(problem, generations, seed) for seed in seeds]))
-    with_numpy = other + numpy_seconds(problem) * POPULATION * generations
-    yield f"{ours}; pymoo with the same kernel takes (>= 4) {other / seconds:.2f} times as long"
-    yield f"    pymoo with numpy evaluation (>= 40), estimated from one evaluation: {with_numpy / seconds:.0f} times"
+    plain, other = [], []
+    for seed in seeds:
+        plain.append(timed(problem, "nsga2", generations, seed))
+        other.append(pymoo_seconds(problem, generations, seed))
+    times = [seconds for seconds, _ in plain]
+    seconds = float(np.median(times))
+    ratios = [slow / fast for slow, fast in zip(other, times, strict=True)]
+    yield Row(f"NSGA-II {POPULATION} x {generations} against pymoo, same kernel", 4.0, ratios)
+    slow_each = numpy_seconds(problem)
+    with_numpy = [(slow + slow_each * POPULATION * generations) / fast for slow, fast in zip(other, times, strict=True)]
+    yield Row("NSGA-II against pymoo with numpy evaluation (one evaluation measured)", 40.0, with_numpy)
+    if not long:
+        return
     budget = generations
     for _ in range(3):  # the memetic budget that takes the CPU of one plain run
-        taken, _ = timed(problem, "memetic", budget, 0)
-        budget = max(5, round(budget * seconds / taken))
+        taken = float(np.median([timed(problem, "memetic", budget, seed)[0] for seed in (11, 12, 13)]))
+        budget = max(5, int(budget * seconds / taken))
     memetic = [timed(problem, "memetic", budget, seed) for seed in seeds]
     longer = [timed(problem, "nsga2", 20 * generations, seed) for seed in seeds]
-    yield (
-        f"default engine, {np.mean([t for t, _ in memetic]):.2f} s: hypervolume {np.mean([h for _, h in memetic]):.4f};"
-        f" plain engine run 20 times longer, {np.mean([t for t, _ in longer]):.1f} s:"
-        f" {np.mean([h for _, h in longer]):.4f}; the same: {np.mean([h for _, h in plain]):.4f}"
-    )
+    ours, theirs = np.mean([volume for _, volume in memetic]), np.mean([volume for _, volume in longer])
+    yield Row("mean hypervolume, default engine over the plain one run 20 times longer", 1.0, [float(ours / theirs)])
+    taken = np.mean([spent for spent, _ in memetic])
+    yield Row(f"default {taken:.2f} s: {ours:.4f}, plain {seconds:.2f} s, 20 times longer: {theirs:.4f}", None, [])

@@ -13,6 +13,7 @@ from netdesign.console import show as _print
 from netdesign.console import words as _words
 from netdesign.console import workers as _workers
 from netdesign.errors import InputError, NetdesignError
+from netdesign.interruption import end_cleanly
 
 # Typer brings its own click along, or takes the installed one: the class is found from what it exports.
 CommandProblem = cast(type[Exception], typer.BadParameter.__mro__[2])
@@ -273,8 +274,10 @@ def doctor(as_json: JsonFlag = False) -> None:
 def main() -> None:
     """Run the command line and leave with the exit status of the contract."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads would only wait for each other
+    end_cleanly()
     try:
-        app(standalone_mode=False)
+        if app(standalone_mode=False) == 130:  # what Typer makes of a KeyboardInterrupt
+            raise KeyboardInterrupt
     except CommandProblem as problem:
         error: Any = problem
         message = " ".join(str(error.format_message()).split())

@@ -20,7 +20,7 @@ from netdesign.placement.free_problem import problem_of
 from netdesign.placement.network_problem import NetworkProblem
 from netdesign.run_folder import run_folder, start_run
 from netdesign.search.engine import run as search
-from netdesign.search.state import State
+from netdesign.search.state import State, discard
 from netdesign.search.state import load as load_state
 from netdesign.search.state import save as save_state
 
@@ -62,7 +62,7 @@ def design_study(
     state = _searched(task, problem, run / CHECKPOINT, resume, progress)
     design = finish(problem, state, progress)
     write_design(run / "design.json", task, design)
-    (run / CHECKPOINT).unlink(missing_ok=True)
+    discard(run / CHECKPOINT)
     return DesignOutcome(run=run, summary=_summary(task, run, design, int(state.evaluations[-1])))
 
 

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -135,3 +136,50 @@ def test_a_run_folder_holds_one_study(run, tmp_path):
     assert result.returncode == 2
     assert "another" in result.stderr
     assert (run / "design.json").read_bytes() == before
+
+
+LONGER = STUDY.replace("population = 40\ngenerations = 10", "population = 100\ngenerations = 16000")
+
+
+@pytest.mark.slow
+def test_killed_ten_times_and_resumed_the_result_is_the_same(tmp_path):
+    """SIGKILL at random moments, with one or two threads: the bytes of design.json do not change."""
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    for folder in (whole, killed):
+        folder.mkdir()
+    assert design(whole, LONGER, "--threads", "1").returncode == 0
+    path, run = killed / "study.toml", killed / "run"
+    path.write_text(LONGER)
+    rng, survived = np.random.default_rng(0), 0
+    for attempt in range(10):
+        command = [sys.executable, "-m", "netdesign", "design", str(path), "-o", str(run), "--resume"]
+        process = subprocess.Popen([*command, "--threads", str(1 + attempt % 2)], stderr=subprocess.DEVNULL)
+        until = time.monotonic() + 60
+        while not (run / "study.toml").is_file() and time.monotonic() < until:
+            time.sleep(0.05)
+        time.sleep(rng.uniform(0.5, 5.0))
+        process.kill()
+        process.wait()
+        survived += (run / "checkpoint.npz").is_file()
+        assert not (run / "design.json").is_file()  # killed before its end
+    assert survived >= 1
+    result = design(killed, LONGER, "--resume", "--threads", "2")
+    assert result.returncode == 0, result.stderr
+    assert (run / "design.json").read_bytes() == (whole / "run" / "design.json").read_bytes()
+    assert sorted(entry.name for entry in run.iterdir()) == ["design.json", "inputs", "study.toml"]
+
+
+def test_a_termination_is_one_line_and_keeps_what_is_done(tmp_path):
+    path, run = tmp_path / "study.toml", tmp_path / "run"
+    path.write_text(LONGER.replace("generations = 16000", "generations = 100000"))
+    command = [sys.executable, "-m", "netdesign", "design", str(path), "-o", str(run)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 100
+    while not (run / "checkpoint.npz").is_file() and time.monotonic() < until:
+        time.sleep(0.1)
+    process.terminate()
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert said.splitlines()[-1] == "netdesign: interrupted, what is done is kept"
+    assert "@" not in said  # no stack trace of glog's
+    assert (run / "checkpoint.npz").is_file()

@@ -4,13 +4,15 @@ Two conventions are converted here and nowhere else: COLMAP's pixel origin (top-
 (0, 0), and cam_from_world to world_from_cam. Lengths in the files are mm, inside they are metres.
 """
 
+import signal
 import tempfile
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pycolmap
 from scipy.spatial.transform import Rotation
 
 from netdesign.errors import InputError
@@ -76,6 +78,7 @@ def write_model(folder: Path, model: ColmapModel) -> None:
 
     Cameras are written as OPENCV, image ids count from 1 in the order of ``model.names``.
     """
+    pycolmap = _pycolmap()
     reconstruction = pycolmap.Reconstruction()
     for camera_id, camera in zip(model.camera_ids, model.cameras, strict=True):
         parameters = camera.intrinsics.copy()
@@ -174,3 +177,13 @@ def _camera(line: CameraLine) -> Camera:
         principal_point_px=np.array([cx, cy]) - PIXEL_ORIGIN,
         distortion=np.array(distortion),
     )
+
+
+def _pycolmap() -> Any:
+    """Import pycolmap and take SIGTERM back: it would answer with a stack trace instead of keeping what is done."""
+    before = signal.getsignal(signal.SIGTERM)
+    import pycolmap
+
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
+    return pycolmap

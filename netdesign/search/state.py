@@ -5,7 +5,6 @@ import os
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 
 import numpy as np
 
@@ -70,14 +69,23 @@ def save(path: Path, state: State, key: str) -> None:
     for prefix, population in (("population", state.population), ("archive", state.archive.members)):
         for field in fields(population):
             arrays[f"{prefix}_{field.name}"] = getattr(population, field.name)
-    scratch = NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}-", delete=False)
     try:
-        with scratch:
+        with _beside(path).open("wb") as scratch:
             np.savez(scratch, **arrays)  # type: ignore[arg-type]
-        os.replace(scratch.name, path)
+        os.replace(_beside(path), path)
     except BaseException:
-        Path(scratch.name).unlink(missing_ok=True)
+        _beside(path).unlink(missing_ok=True)
         raise
+
+
+def discard(path: Path) -> None:
+    """Remove a checkpoint that is no longer needed, and what a search killed while it wrote may have left beside it."""
+    path.unlink(missing_ok=True)
+    _beside(path).unlink(missing_ok=True)
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.part")
 
 
 def load(path: Path, key: str) -> State:

@@ -24,7 +24,7 @@ from netdesign.files.noise import read_corner_noise
 from netdesign.files.store import write_bytes, write_json, write_text
 from netdesign.imaging.measure import Gates, TagMeasurement, measure
 from netdesign.imaging.photograph import Photographer, Shoot
-from netdesign.imaging.pictures import png_bytes, read_picture
+from netdesign.imaging.pictures import linear, png_bytes, read_picture
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.camera import Camera
 from netdesign.model.network import Observations
@@ -91,17 +91,21 @@ def render_images(
 
 def measure_images(
     paths: Sequence[Path], camera: Camera, targets: Targets, *, gates: Gates | None = None,
-    floor_px: float | None = None, executor: Executor | None = None, progress: Progress = silent,
+    floor_px: float | None = None, gamma: float = 1.0, executor: Executor | None = None, progress: Progress = silent,
 ) -> list[list[TagMeasurement]]:  # fmt: skip
     """Detect and fit the tags of every picture; look at ``rejected`` before use.
 
     Args:
         floor_px: systematic error of the method added to every coordinate's variance; None takes the camera's
             calibrated noise, else the shipped one.
+        gamma: exponent that makes the pictures linear in light (``imaging.tone``).
+
+    Raises:
+        InputError: a picture cannot be read or is not of the camera's size.
     """
     if floor_px is None:
         floor_px = (camera.corner_noise or read_corner_noise(None)).floor_px
-    jobs = [(path, camera, targets, gates, floor_px) for path in paths]
+    jobs = [(path, camera, targets, gates, floor_px, gamma) for path in paths]
     return list(each(_measure_one, jobs, executor, "measure", progress))
 
 
@@ -219,10 +223,12 @@ def _render_one(job: tuple[bytes, int, Floats, Path]) -> None:
     write_bytes(path, png_bytes(_session(session).take(index, world_from_cam)))
 
 
-def _measure_one(job: tuple[Path, Camera, Targets, Gates | None, float]) -> list[TagMeasurement]:
-    path, camera, targets, gates, floor_px = job
+def _measure_one(job: tuple[Path, Camera, Targets, Gates | None, float, float]) -> list[TagMeasurement]:
+    path, camera, targets, gates, floor_px, gamma = job
     ids = set(targets.ids.tolist())
-    return measure(read_picture(path), camera, targets.family, targets.size_m, ids, gates, floor_px)
+    picture = read_picture(path, camera)
+    straight = picture if gamma == 1.0 else linear(picture, gamma)
+    return measure(straight, camera, targets.family, targets.size_m, ids, gates, floor_px)
 
 
 def each(

@@ -17,10 +17,12 @@ from netdesign.adjustment.problem import BundleProblem
 from netdesign.adjustment.solver import solve
 from netdesign.errors import InfeasibleError
 from netdesign.files.observations import ObservationSet
-from netdesign.files.photo_folder import photos_in, read_camera_and_targets
+from netdesign.files.photo_folder import photos_in, read_camera_and_targets, read_gamma
 from netdesign.imageset import measure_images
 from netdesign.imaging.detect import pose_from_tag
 from netdesign.imaging.measure import Gates, TagMeasurement
+from netdesign.imaging.pictures import read_picture
+from netdesign.imaging.tone import Tone, estimate_tone
 from netdesign.model.adjustment import ControlPoints
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.camera import Camera
@@ -30,7 +32,9 @@ from netdesign.model.progress import Progress
 from netdesign.model.scene import CORNERS_PER_TAG, Targets
 from netdesign.photogrammetry.connectivity import listed, named
 
-LOOSE_CHI2 = 1e6  # with a sigma given by the user the photometric misfit of a tag is not judged
+LEAST_CONTRAST = 0.01  # of full scale; 12 bits stored in 16 use a sixteenth of it
+DOUBTFUL_BOW = 0.05  # 0.02 px
+SAMPLES = 4  # photographs that tell the tone curve and the noise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +60,7 @@ def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress, ref
     """Measure the photographs and find approximate values.
 
     Args:
-        sigma_px: noise of an image coordinate instead of the measured covariances; the pictures then need not follow
-            the camera's sensor model.
+        sigma_px: noise of an image coordinate instead of the measured covariances.
         refine: interior parameters that are not known well; free already where the scale is found.
 
     Raises:
@@ -66,9 +69,11 @@ def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress, ref
     """
     photos = photos_in(folder)
     camera, targets, known = read_camera_and_targets(folder)
+    stated = read_gamma(folder)
+    tone = _tone(photos, camera, targets, stated)
     # The sensor behind a photograph is rarely the one that camera.toml describes: each picture tells its own noise.
-    gates = Gates(own_noise=True) if sigma_px is None else Gates(chi2_base=LOOSE_CHI2)
-    measured = measure_images(photos, camera, targets, gates=gates, progress=progress)
+    gates = Gates(own_noise=True, noise_scale=tone.noise, min_contrast=LEAST_CONTRAST)
+    measured = measure_images(photos, camera, targets, gates=gates, gamma=tone.gamma, progress=progress)
     good = [[tag for tag in tags if not tag.rejected] for tags in measured]
     refused = [tag.rejected for tags in measured for tag in tags if tag.rejected]
     seen = np.array([len(tags) > 0 for tags in good])
@@ -78,7 +83,7 @@ def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress, ref
             f"{folder}: expected tags in at least 2 photographs, found them in {int(seen.sum())} of {len(photos)}; "
             f"{len(refused)} tag(s) were refused{': ' + refused[0] if refused else ''}"
         )
-    notes = []
+    notes = _tone_notes(tone, stated)
     if not seen.all():
         notes.append(
             f"{int((~seen).sum())} photograph(s) show no usable tag and are left out: {listed(named(names, ~seen))}"
@@ -92,6 +97,29 @@ def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress, ref
     else:
         found, left_out = _tied(_on_tags_alone(kept, kept_names, camera, targets, sigma_px, refine))
     return PhotoSet(observations=found, notes=(*notes, *left_out))
+
+
+def _tone(photos: Sequence[Path], camera: Camera, targets: Targets, stated: float | None) -> Tone:
+    """Return the tone curve and the noise of the series from a few of its photographs."""
+    chosen = [photos[index] for index in np.unique(np.linspace(0, len(photos) - 1, SAMPLES).astype(int))]
+    pictures = [read_picture(path, camera) for path in chosen]
+    return estimate_tone(pictures, camera, targets.family, set(targets.ids.tolist()), stated)
+
+
+def _tone_notes(tone: Tone, stated: float | None) -> list[str]:
+    """Return what the user should know about the tone curve."""
+    if stated is None and tone.gamma != 1.0:
+        return [
+            f"the photographs are not linear in light: gamma {tone.gamma:.2f} estimated from {tone.tags} tags and "
+            "undone (camera.toml, [photographs] gamma states it)"
+        ]
+    if abs(tone.bow) > DOUBTFUL_BOW:
+        known = "as stored" if tone.gamma == 1.0 else f"with gamma {tone.gamma:g} undone"
+        return [
+            f"the photographs {known} are not linear in light, and no power makes them so: corners may be shifted "
+            f"by about {0.3 * abs(tone.bow):.2f} px towards the tags' centres or away"
+        ]
+    return []
 
 
 def _tied(found: ObservationSet) -> tuple[ObservationSet, list[str]]:

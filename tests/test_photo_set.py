@@ -128,7 +128,7 @@ def test_bad_image_sets_are_one_line(tmp_path):
     from netdesign.imaging.pictures import png_bytes
 
     for name in ("a.png", "b.png"):
-        (folder / "images" / name).write_bytes(png_bytes(np.full((200, 300), 128, np.uint8)))
+        (folder / "images" / name).write_bytes(png_bytes(np.full((2048, 2448), 128, np.uint8)))
     with pytest.raises(InfeasibleError, match="expected tags in at least 2 photographs, found them in 0 of 2"):
         adjust_folder(folder)
     (folder / "camera.toml").write_text(CAMERA_TOML.replace("size_mm = 20", ""))

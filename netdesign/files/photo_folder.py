@@ -2,6 +2,7 @@
 
 camera.toml         [camera] as in a study; optional [targets] with family and size_mm (edge of the black squares)
 images/*.png …      the photographs, or beside camera.toml
+                    optional [photographs] with gamma, the exponent of the tone curve (1 for linear; else estimated)
 targets.csv         nominal tags as in a study (tag,x_mm,y_mm,z_mm,nx,ny,nz,ux,uy,uz), or
 tags.csv            tag,size_mm, when nothing is known of the part; or nothing: every tag of the family counts
 """
@@ -27,6 +28,23 @@ def photos_in(folder: Path) -> list[Path]:
     """Return the photographs, by name."""
     place = folder / "images" if (folder / "images").is_dir() else folder
     return sorted(path for path in place.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+
+
+def read_gamma(folder: Path) -> float | None:
+    """Return the exponent of the tone curve that camera.toml states, None when it is to be estimated.
+
+    Raises:
+        InputError: not a number from 0.2 to 5.
+    """
+    path = folder / "camera.toml"
+    table = read_toml(path).get("photographs", {})
+    unknown = sorted(set(table) - {"gamma"}) if isinstance(table, dict) else ["photographs"]
+    if unknown:
+        raise InputError(f"{path}: photographs: expected gamma, found {unknown[0]}")
+    gamma = table.get("gamma")
+    if gamma is not None and not (isinstance(gamma, int | float) and 0.2 <= gamma <= 5):
+        raise InputError(f"{path}: photographs.gamma: expected a number from 0.2 to 5, found {gamma!r}")
+    return None if gamma is None else float(gamma)
 
 
 def read_camera_and_targets(folder: Path) -> tuple[Camera, Targets, bool]:

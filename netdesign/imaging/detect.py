@@ -20,6 +20,7 @@ from netdesign.model.frames import inverse, pose
 
 # OpenCV's default, 3 % of the longer side, hides tags below 31 px in a 4096 px picture.
 SMALLEST_PERIMETER_PX = 40.0
+DARK = 100.0  # of 255: below it a picture is stretched before the search
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,13 +35,13 @@ def detect(picture: NDArray[np.generic], family: str, ids: Collection[int] | Non
     """Return the tags of a picture, by id; a tag that shows twice is returned twice.
 
     Args:
-        picture: (h, w) uint8, or uint16 of which the upper 8 bits are used.
+        picture: (h, w) uint8 or uint16; how bright it is does not matter.
         ids: the ids that may occur; others are left out. None: every id of the family.
 
     Raises:
         InputError: the family is not known.
     """
-    grey = np.ascontiguousarray(picture if picture.dtype == np.uint8 else np.asarray(picture, np.uint16) >> 8, np.uint8)
+    grey = _eight_bits(picture)
     sighted: list[Sighted] = []
     for item in _recognised(grey, family, ids):
         _add(item, sighted)
@@ -51,6 +52,16 @@ def detect(picture: NDArray[np.generic], family: str, ids: Collection[int] | Non
             # Pixel centres: the enlarged picture has its first sample at -0.25.
             _add(Sighted(tag_id=item.tag_id, corners_px=item.corners_px / 2 - 0.25), sighted)
     return sorted(sighted, key=lambda item: (item.tag_id, *item.corners_px.ravel().tolist()))
+
+
+def _eight_bits(picture: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """Return the picture in 8 bits; 16-bit and dark ones stretched by a square root, which keeps the dark apart."""
+    bright = float(np.quantile(np.asarray(picture[::4, ::4], np.float64), 0.995)) if picture.size else 0.0
+    if picture.dtype == np.uint8 and bright >= DARK:
+        return np.ascontiguousarray(picture, np.uint8)
+    level = np.arange(65536 if picture.dtype == np.uint16 else 256) / max(bright, 1.0)
+    table = np.rint(255 * np.sqrt(np.minimum(level, 1.0))).astype(np.uint8)
+    return np.ascontiguousarray(table[np.asarray(picture)])
 
 
 def _recognised(grey: NDArray[np.generic], family: str, ids: Collection[int] | None) -> list[Sighted]:

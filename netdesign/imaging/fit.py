@@ -39,7 +39,9 @@ class Fit:
         corners_px: (4, 2) measured pixels.  covariance_px2: (8, 8), order x0 y0 x1 y1 …; inf when not converged.
         chi2_per_dof: weighted residuals per degree of freedom; pixels: how many were used.
         black, white, surround: grey levels.  light_slope: (2,) relative change from the centre to the edge.
-        sigma_px: blur.  converged: False when the corners still moved or the normal matrix was singular.
+        sigma_px: blur.  bow: how far mid tones lie above the model, in units of the bow t (1 - t) of a tone t between
+            black and white; 0 for a picture linear in light, only its sign and its zero mean something.
+        converged: False when the corners still moved or the normal matrix was singular.
     """
 
     corners_px: Floats
@@ -51,6 +53,7 @@ class Fit:
     surround: float
     light_slope: Floats
     sigma_px: float
+    bow: float
     converged: bool
     iterations: int
 
@@ -159,6 +162,23 @@ def _grid(x: Floats, y: Floats, intrinsics: Floats, bent: bool) -> Floats:
     return ideal_pixels(grid.reshape(-1, 2), intrinsics).reshape(grid.shape) if bent else grid
 
 
+def _bow(patch: _Patch, levels: Floats, frame: Floats) -> float:
+    """Return the bow of the tone curve that the residuals show.
+
+    The residuals are orthogonal to everything that was estimated, so that their product with the bow vanishes when
+    there is none, however much of it a shrunken tag could imitate.
+    """
+    black, white, surround, slope_x, slope_y = levels
+    if white <= black:
+        return 0.0
+    away = (patch.centres - frame[:2]) / frame[2]
+    light = 1.0 + slope_x * away[..., 0] + slope_y * away[..., 1]
+    tone = patch.model[0] + patch.model[1] * (surround - black) / (white - black)
+    shape = np.where(patch.inside, light * (white - black) * tone * (1.0 - tone), 0.0)
+    gap = patch.grey - light * (black + (white - black) * tone)
+    return float((shape * gap).sum() / max(float((shape * shape).sum()), 1e-12))
+
+
 def _smoothed(corners: Floats) -> float:
     """Return by how much ``cover`` smooths the two directions of edges, mean variance in sub-pixels squared."""
     variance = 0.0
@@ -246,6 +266,6 @@ def fit_tag(
         corners_px=measured,
         covariance_px2=spread @ covariance[:8, :8] @ spread.T if converged else np.full((8, 8), np.inf),
         chi2_per_dof=chi2 / max(pixels - UNKNOWNS, 1), pixels=pixels, black=float(levels[0]), white=float(levels[1]),
-        surround=float(levels[2]), light_slope=levels[3:].copy(), sigma_px=sigma,
+        surround=float(levels[2]), light_slope=levels[3:].copy(), sigma_px=sigma, bow=_bow(patch, levels, frame),
         converged=converged, iterations=iteration,
     )  # fmt: skip

@@ -27,6 +27,7 @@ class Gates:
         border_px: a tag with a corner nearer to the frame's edge is not measured.
         own_noise: for photographs of an unknown sensor or exposure: the noise is the sensor model times the median
             chi²/dof of the picture's tags, and a tag is judged against that. It cannot see what all tags share.
+        noise_scale: the factor for pictures of fewer than FEW tags, from the other pictures of the series.
     """
 
     max_incidence: float = float(np.radians(70.0))
@@ -39,6 +40,10 @@ class Gates:
     max_clipped: float = 0.02
     border_px: float = 2.0
     own_noise: bool = False
+    noise_scale: float = 1.0
+
+
+FEW = 5  # tags of a picture that cannot judge each other
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,15 +88,15 @@ def measure(
     """
     judge = gates or Gates()
     full_scale = 65535.0 if picture.dtype == np.uint16 else 255.0
-    gain = full_scale / camera.full_well_e
-    floor = (gain * camera.read_noise_e) ** 2 + 1 / 12
+    gain, floor = sensor_noise(picture, camera)
     seeds = detect(picture, family, ids)
     fits = [
         fit_tag(picture, cells(family, seed.tag_id), seed.corners_px, camera.intrinsics, gain, floor) for seed in seeds
     ]
     scale = 1.0
-    if judge.own_noise and any(fit.converged for fit in fits):
-        scale = float(np.median([fit.chi2_per_dof for fit in fits if fit.converged]))
+    if judge.own_noise:
+        noise = [fit.chi2_per_dof for fit in fits if fit.converged]
+        scale = float(np.median(noise)) if len(noise) >= FEW else judge.noise_scale
     measured = []
     for seed, raw in zip(seeds, fits, strict=True):
         fit = replace(raw, covariance_px2=scale * raw.covariance_px2, chi2_per_dof=raw.chi2_per_dof / scale)
@@ -123,10 +128,24 @@ def measure(
     ]
 
 
+def sensor_noise(picture: NDArray[np.generic], camera: Camera) -> tuple[float, float]:
+    """Return gain and floor: the variance of a grey level of the picture is gain · level + floor."""
+    gain = (65535.0 if picture.dtype == np.uint16 else 255.0) / camera.full_well_e
+    return gain, (gain * camera.read_noise_e) ** 2 + 1 / 12
+
+
 def _incidence(fit: Fit, size_m: float, intrinsics: Floats) -> float:
     """Return the angle (rad) between the tag's normal and the direction to the camera."""
     position = pose_from_tag(fit.corners_px, size_m, intrinsics)[0][0][:3, 3]
     return float(np.arccos(np.clip(position[2] / np.linalg.norm(position), -1.0, 1.0)))
+
+
+def _white_limit(picture: NDArray[np.generic]) -> float:
+    """Return the level at which the picture clips: full scale, or that of 10 to 14 bits stored in 16."""
+    largest = int(picture.max(initial=0))
+    narrow = {2**bits - 1 for bits in (10, 12, 14)} | {(2**bits - 1) << (16 - bits) for bits in (10, 12, 14)}
+    full_scale = 65535 if picture.dtype == np.uint16 else 255
+    return float(largest if picture.dtype == np.uint16 and largest in narrow else full_scale)
 
 
 def _reason(
@@ -140,7 +159,7 @@ def _reason(
     if (low < gates.border_px).any() or (high > np.array(picture.shape[::-1]) - 1 - gates.border_px).any():
         return "cut by the frame"
     (left, top), (right, bottom) = low.astype(int), high.astype(int) + 1
-    clipped = float(np.mean(np.greater_equal(picture[top:bottom, left:right], full_scale)))
+    clipped = float(np.mean(np.greater_equal(picture[top:bottom, left:right], _white_limit(picture))))
     if clipped > gates.max_clipped:
         return f"{100 * clipped:.1f} % of the pixels clipped, at most {100 * gates.max_clipped:.1f} % allowed"
     if cell_px < gates.min_cell_px:

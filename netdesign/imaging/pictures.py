@@ -7,7 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netdesign.errors import InputError
+from netdesign.model.camera import Camera
 
+# The last bytes of a whole file; OpenCV fills what is missing of a shorter one with grey.
+ENDS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 COMPRESSION = 1  # of 9: sensor noise does not compress, more effort only costs time
 
 
@@ -28,15 +31,24 @@ def linear(picture: NDArray[np.generic], gamma: float) -> NDArray[np.uint16]:
     return np.asarray(table[np.asarray(picture, np.int64)])
 
 
-def read_picture(path: Path) -> NDArray[np.generic]:
+def read_picture(path: Path, camera: Camera | None = None) -> NDArray[np.generic]:
     """Read a picture as grey levels (h, w), uint8 or uint16; colour is averaged as OpenCV does.
 
     Raises:
-        InputError: missing or no image.
+        InputError: missing, no image, cut short, or not of the camera's size.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such image")
-    picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
+    content = path.read_bytes()
+    end = ENDS.get(path.suffix.lower())
+    if end is not None and end not in content[-1024:]:
+        raise InputError(f"{path}: expected an image of 8 or 16 bit, found one that is cut short or none")
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
     if picture is None or picture.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path}: expected an image of 8 or 16 bit, found something else")
+    if camera is not None and picture.shape != (camera.height_px, camera.width_px):
+        raise InputError(
+            f"{path}: expected {camera.width_px} x {camera.height_px} px as the camera has, found "
+            f"{picture.shape[1]} x {picture.shape[0]}"
+        )
     return np.asarray(picture)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from netdesign.adjustment.bundle import adjust
-from netdesign.adjustment.campaign import Member, member_of, pool
+from netdesign.adjustment.campaign import RHO_MARGIN, Band, Member, _realisations_needed, member_of, pool
 from netdesign.adjustment.compare import compare
 from netdesign.adjustment.estimate import estimate
 from netdesign.adjustment.lengths import chosen_lengths, length_test, length_uncertainty
@@ -95,6 +95,20 @@ def test_one_network_proves_nothing(right):
     assert np.isnan(campaign.slope.value)
     with pytest.raises(InfeasibleError, match="nothing to pool"):
         pool([])
+
+
+@pytest.mark.parametrize(("value", "half"), [(1.0, 0.5), (1.05, 0.2), (0.93, 0.31)])
+def test_as_many_realisations_as_said_narrow_the_interval_enough(value, half):
+    """The width of an interval falls with the root of the number: what is said fits, one less does not."""
+    count = 5
+
+    def band(number):
+        reach = np.exp(half * np.sqrt(count / number))
+        return Band(value=value, low=value / reach, high=value * reach, margin=RHO_MARGIN)
+
+    needed = _realisations_needed(band(count), count)
+    assert band(needed).equivalent
+    assert not band(needed - 1).equivalent
 
 
 def test_slope_is_one_over_networks_of_different_precision():

@@ -79,6 +79,11 @@ def test_pictures_that_are_cut_short_or_of_another_size_are_refused(tmp_path, li
         read_picture(path, CAM)
     half = tmp_path / "0001.jpg"
     content = cv2.imencode(".jpg", np.asarray(expose(light, CAM, None, 8)))[1].tobytes()
+    preview = b"\xff\xe1\x00\x08\xff\xd8\xff\xd9ab"  # a segment that holds a small whole picture
+    for more in (content, content + bytes(5000), content[:2] + preview + content[2:]):
+        half.write_bytes(more)  # what telephones write
+        assert read_picture(half, CAM).shape == (640, 800)
+    content = content[:2] + preview + content[2:]
     half.write_bytes(content[: len(content) // 2])
     with pytest.raises(InputError, match="cut short"):
         read_picture(half, CAM)

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from netdesign.errors import InputError
 from netdesign.model.camera import Camera
 
-# The last bytes of a whole file; OpenCV fills what is missing of a shorter one with grey.
-ENDS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 COMPRESSION = 1  # of 9: sensor noise does not compress, more effort only costs time
 
 
@@ -40,8 +38,7 @@ def read_picture(path: Path, camera: Camera | None = None) -> NDArray[np.generic
     if not path.is_file():
         raise InputError(f"{path}: no such image")
     content = path.read_bytes()
-    end = ENDS.get(path.suffix.lower())
-    if end is not None and end not in content[-1024:]:
+    if not _whole(content):
         raise InputError(f"{path}: expected an image of 8 or 16 bit, found one that is cut short or none")
     picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
     if picture is None or picture.dtype not in (np.uint8, np.uint16):
@@ -52,3 +49,20 @@ def read_picture(path: Path, camera: Camera | None = None) -> NDArray[np.generic
             f"{picture.shape[1]} x {picture.shape[0]}"
         )
     return np.asarray(picture)
+
+
+def _whole(content: bytes) -> bool:
+    """Tell whether a PNG or JPEG has its end mark: OpenCV fills what is missing of a shorter one with grey.
+
+    Cameras put data of their own behind the mark, and a preview with an end mark of its own before the picture.
+    """
+    if content.startswith(b"\x89PNG"):
+        return b"IEND" in content
+    if not content.startswith(b"\xff\xd8"):
+        return True  # of another format; the decoder decides
+    place = 2
+    while place + 4 <= len(content) and content[place] == 0xFF:
+        if content[place + 1] == 0xDA:  # the scan: inside it a byte ff is always followed by 00 or a restart mark
+            return content.find(b"\xff\xd9", place) >= 0
+        place += 2 + int.from_bytes(content[place + 2 : place + 4], "big")
+    return False

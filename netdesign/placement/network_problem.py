@@ -1,5 +1,6 @@
 """What every camera network problem offers to ``search`` and to ``finish``, whatever the stations."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Self
@@ -22,7 +23,7 @@ TELEPORTS = 0.08  # share of the moves that go anywhere
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkProblem:
+class NetworkProblem(ABC):
     """A study, ready to be searched. Chromosomes hold the free stations; ``task.existing`` belong to every network.
 
     Attributes:
@@ -39,38 +40,38 @@ class NetworkProblem:
     gauge: Floats | None = None
     joint_map: JointMap | None = None
 
+    @abstractmethod
     def evaluate(self, bits: Bools, genes: Floats) -> tuple[Floats, Floats]:
         """Return objectives (P, 3) in SI units and violation (P,) of chromosomes."""
-        raise NotImplementedError
 
+    @abstractmethod
     def improve(self, rng: np.random.Generator, members: Population) -> Population:
         """Return evaluated neighbours of feasible members, found by a local search from each of them."""
-        raise NotImplementedError
 
+    @abstractmethod
     def limited_scores(self, bits: Bools, genes: Floats) -> tuple[Floats, Floats]:
         """Return f1 of the limited propagation and violation, whatever the tour and the criterion's propagation."""
-        raise NotImplementedError
 
+    @abstractmethod
     def candidates(self) -> Floats:
         """Return viewpoints (c, d) all over the admissible set, within reach, that see enough for an image."""
-        raise NotImplementedError
 
+    @abstractmethod
     def sees(self, viewpoints: Floats) -> Bools:
         """Return (k, g) the tags that are seen from viewpoints (k, d) for certain."""
-        raise NotImplementedError
 
+    @abstractmethod
     def bounds(self, sizes: Iterable[int]) -> dict[int, float]:
         """Return proven lower bounds on f1 by number of images; empty where nothing is proved."""
-        raise NotImplementedError
 
+    @abstractmethod
     def without_tour_limit(self) -> Self:
         """Return the problem without requirements.max_tour; itself when there is none."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def longest(self) -> float:
         """The longest admissible tour, inf when there is no limit."""
-        raise NotImplementedError
 
     @property
     def existing_sees(self) -> Bools:

@@ -1,0 +1,63 @@
+"""What a proved network says against itself: points by their names, in words that fit what happened."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from netdesign.adjustment.diagnosis import SHARE_HARDLY_CHECKED, quality_warnings
+from netdesign.adjustment.estimate import estimate
+from netdesign.files.design_json import read_networks
+from netdesign.model.network import Observations
+from netdesign.photogrammetry.collinearity import project
+from netdesign.placement.distances import network_total_error
+from netdesign.proof import _adjusted
+from tests.bundle_cases import observe, problem_of, relief
+from tests.runs import convex_visible, ring_run
+
+
+@pytest.fixture(scope="module")
+def proved(tmp_path_factory):
+    run = tmp_path_factory.mktemp("proof") / "run"
+    task = ring_run(run)
+    return task, max(read_networks(run).values(), key=lambda network: len(network.world_from_cam))
+
+
+def test_a_point_that_loses_its_rays_to_the_outlier_test_is_not_called_unseen(proved):
+    task, network = proved
+    poses, points = network.world_from_cam, task.scene.targets.points
+    visible = convex_visible(task, poses)
+    visible[np.flatnonzero(visible[:, 0])[3:], 0] = False  # three rays, one of them wrong
+    image, point = np.nonzero(visible)
+    sigma = task.camera.sigma_px
+    xy = project(poses[image], points[point], task.camera.intrinsics)[0]
+    xy = xy + np.random.default_rng(0).normal(scale=sigma, size=xy.shape)
+    xy[np.flatnonzero(point == 0)[1]] += 40.0
+    covariance = np.tile(sigma**2 * np.eye(2), (len(image), 1, 1))
+    observations = Observations(image=image, point=point, xy_px=xy, covariance=covariance)
+    _, adjustment = _adjusted(task, network, observations, [f"{index}.png" for index in range(len(poses))])
+    warnings = adjustment.warnings
+    name = task.scene.targets.point_ids[0]
+    assert any("lost their rays to the outlier test" in text and text.endswith(name) for text in warnings)
+    assert not any("in no image" in text for text in warnings)
+
+
+def test_what_total_propagation_flags_is_named_as_the_design_names_it(proved):
+    task, network = proved
+    diagnosis = network_total_error(task, network.world_from_cam[:3]).diagnosis
+    assert diagnosis
+    assert any(name in text for text in diagnosis for name in task.scene.targets.point_ids), diagnosis
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.5 * SHARE_HARDLY_CHECKED, False), (2 * SHARE_HARDLY_CHECKED, True)])
+def test_a_few_hardly_checked_image_points_are_no_flag(share, told):
+    poses, points = relief(6, 40)
+    problem = problem_of(observe(poses, points, np.ones((6, 40), bool)), poses, points)
+    adjustment = estimate(problem)
+    numbers = np.full_like(adjustment.redundancy_numbers, 0.6)
+    numbers[: round(share * len(numbers))] = 0.05
+    nothing = np.zeros(len(points))
+    warnings = quality_warnings(
+        problem, replace(adjustment, redundancy_numbers=numbers), (), nothing, nothing.astype(bool)
+    )
+    assert any("a gross error in them would hardly show" in text for text in warnings) == told

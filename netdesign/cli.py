@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, cast
 import typer
 
 from netdesign.console import as_json as _json
+from netdesign.console import conclude as _conclude
 from netdesign.console import progress as _progress
 from netdesign.console import show as _print
 from netdesign.console import words as _words
@@ -50,7 +51,7 @@ def run(
 
     with _progress() as progress:
         outcome = run_study(study, output, seed=seed, resume=resume, workers=_workers(workers), progress=progress)
-    _print(outcome.summary)
+    _conclude(outcome.summary, outcome.unmet)
 
 
 @app.command()
@@ -89,7 +90,7 @@ def design(
 
     with _progress() as progress:
         outcome = design_study(study, output, seed=seed, resume=resume, threads=_workers(threads), progress=progress)
-    _print(outcome.summary)
+    _conclude(outcome.summary, outcome.unmet)
 
 
 @app.command()

@@ -5,6 +5,8 @@ import os
 import sys
 from typing import TYPE_CHECKING, Any
 
+from netdesign.errors import InfeasibleError
+
 if TYPE_CHECKING:
     from netdesign.terminal import TerminalProgress
 
@@ -13,6 +15,17 @@ def show(text: str) -> None:
     """Write a result to stdout."""
     sys.stdout.write(text.rstrip("\n") + "\n")
     sys.stdout.flush()
+
+
+def conclude(summary: str, unmet: str | None) -> None:
+    """Show what was done and written; then a script must learn that no network keeps the requirements.
+
+    Raises:
+        InfeasibleError: ``unmet`` says why none does.
+    """
+    show(summary)
+    if unmet is not None:
+        raise InfeasibleError(f"requirements: {unmet}")
 
 
 def as_json(value: Any) -> str:

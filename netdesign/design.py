@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numba
 
-from netdesign.files.design_json import read_networks, write_design
+from netdesign.files.design_json import read_networks, read_unmet, write_design
 from netdesign.files.study import load_task, resolve
 from netdesign.model.progress import Progress, silent
 from netdesign.model.results import Design
@@ -30,10 +30,11 @@ SECONDS_BETWEEN_CHECKPOINTS = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class DesignOutcome:
-    """Where the front is, and what to print."""
+    """Where the front is, what to print, and why no network keeps the study's requirements (None: one does)."""
 
     run: Path
     summary: str
+    unmet: str | None
 
 
 def design_study(
@@ -55,7 +56,8 @@ def design_study(
     run = run_folder(resolved, output)
     if resume and (run / "design.json").is_file() and not (run / CHECKPOINT).is_file():
         count = len(read_networks(run))
-        return DesignOutcome(run=run, summary=f"{run}/design.json: {count} networks, finished before")
+        summary = f"{run}/design.json: {count} networks, finished before"
+        return DesignOutcome(run=run, summary=summary, unmet=read_unmet(run))
     numba.set_num_threads(max(1, min(threads, numba.config.NUMBA_NUM_THREADS)))
     problem = problem_of(task, progress)
     start_run(resolved, run)  # nothing is written before the study has turned out to be feasible
@@ -63,7 +65,8 @@ def design_study(
     design = finish(problem, state, progress)
     write_design(run / "design.json", task, design)
     discard(run / CHECKPOINT)
-    return DesignOutcome(run=run, summary=_summary(task, run, design, int(state.evaluations[-1])))
+    summary = _summary(task, run, design, int(state.evaluations[-1]))
+    return DesignOutcome(run=run, summary=summary, unmet=design.answer_reason if design.answer is None else None)
 
 
 def _searched(task: Task, problem: NetworkProblem, checkpoint: Path, resume: bool, progress: Progress) -> State:
@@ -112,6 +115,4 @@ def _summary(task: Task, run: Path, design: Design, evaluations: int) -> str:
             f"requirements: network {design.answer:04d} is the cheapest that meets them, {network.f3} images,"
             f" tour {scale * network.f2:.4g} {unit}: {design.answer_reason}"
         )
-    elif design.answer_reason is not None:
-        lines.append(f"requirements: {design.answer_reason}")
     return "\n".join(lines)

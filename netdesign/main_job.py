@@ -11,10 +11,11 @@ from netdesign.validate import validate_run
 
 @dataclass(frozen=True, kw_only=True)
 class RunOutcome:
-    """What the main job has to say."""
+    """What the main job has to say, and why no network keeps the study's requirements (None: one does)."""
 
     report: Path
     summary: str
+    unmet: str | None
 
 
 def run_study(
@@ -28,4 +29,5 @@ def run_study(
     designed = design_study(study, output, seed=seed, resume=resume, threads=workers, progress=progress)
     validated = validate_run(designed.run, None, workers=workers, dask=None, progress=progress)
     report = write_report(designed.run)
-    return RunOutcome(report=report, summary=f"{designed.summary}\n{validated.summary}\nreport: {report}")
+    summary = f"{designed.summary}\n{validated.summary}\nreport: {report}"
+    return RunOutcome(report=report, summary=summary, unmet=designed.unmet)

@@ -1,10 +1,14 @@
 """Design to a tolerance: the answer keeps every limit, nothing of the front is cheaper, and what is promised holds."""
 
 import re
+import subprocess
+import sys
+import tomllib
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import tomli_w
 
 from netdesign import choose
 from netdesign.errors import InfeasibleError, InputError
@@ -14,6 +18,7 @@ from netdesign.placement.distances import distance_u95, named_ends
 from netdesign.placement.finish import finish
 from netdesign.placement.problem import Problem
 from netdesign.search.engine import run
+from netdesign.starter import write_starter
 from tests.runs import front_of, ring_run, ring_viewpoints
 from tests.scenes import plate_scene
 from tests.test_placement import task_of
@@ -128,3 +133,19 @@ def test_a_distance_between_unknown_points_is_refused_before_the_search():
         Problem.build(
             task_of(plate_scene(side=3), requirements={"distances": [{"from": "0.0", "to": "99.0", "u95_um": 1}]})
         )
+
+
+def test_the_command_writes_the_front_and_leaves_with_3(tmp_path):
+    """A script learns from the exit status that no network keeps the requirements; the front is there all the same."""
+    starter = write_starter(tmp_path / "part", "plate")
+    study = tomllib.loads(starter.read_text())
+    study["search"] = {"population": 8, "generations": 4}
+    study["requirements"] = {"max_sigma_um": 1e-3}
+    starter.write_text(tomli_w.dumps(study))
+    for more in ([], ["--resume"]):
+        command = [sys.executable, "-m", "netdesign", "design", str(starter), "-o", str(tmp_path / "run"), *more]
+        found = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert found.returncode == 3, found.stderr
+        assert "networks" in found.stdout
+        assert found.stderr.splitlines()[-1].startswith("netdesign: requirements: no network meets the requirements:")
+        assert len(choose.front(tmp_path / "run")) > 0

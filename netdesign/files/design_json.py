@@ -87,6 +87,16 @@ def read_networks(run: Path) -> dict[int, PlannedNetwork]:
     return networks
 
 
+def read_unmet(run: Path) -> str | None:
+    """Return why no network of RUN/design.json keeps the study's requirements; None when one does or none are asked.
+
+    Raises:
+        InputError: there is no design.json, or it is not one.
+    """
+    answer = read_json(run / "design.json", "design").get("answer")
+    return None if answer is None or answer["met"] else str(answer["reason"])
+
+
 def find_network(run: Path, number: int) -> PlannedNetwork:
     """Return one network of RUN/design.json.
 

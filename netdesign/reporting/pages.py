@@ -221,9 +221,7 @@ def _inputs(record: RunRecord) -> list[dict[str, str]]:
         ("Datum of the proof", f"{study.validation.datum}: {words.SHORT_DATUM}"),
         ("Seed · version", f"{study.seed} · {record.design.get('netdesign_version', '')}"),
     ]  # fmt: skip
-    if study.requirements.max_sigma_um is not None or study.requirements.distances:
-        asked = [f"U95 {item.from_} to {item.to} ≤ {item.u95_um:g} µm" for item in study.requirements.distances]
-        if study.requirements.max_sigma_um is not None:
-            asked.insert(0, f"largest sigma ≤ {study.requirements.max_sigma_um:g} µm")
+    asked = words.requirements(study)
+    if asked:
         facts.append(("Requirements", "; ".join(asked)))
     return [{"name": name, "value": value} for name, value in facts]

@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 
-from netdesign.model.study import ViewpointsTable
+from netdesign.model.study import Study, ViewpointsTable
 from netdesign.reporting.record import UM, NetworkRecord, RunRecord
 
 LIMITED_DATUM = "exterior orientation error-free (limited error propagation)"
@@ -206,3 +206,11 @@ def stations(table: ViewpointsTable) -> str:
         inner = between if low != high else "shell with semi-axes of "
         return inner + "{:g}, {:g}, {:g} mm".format(*high)
     return f"sphere of {low[0]:g} mm radius" if low == high else f"distance of {low[0]:g} to {high[0]:g} mm"
+
+
+def requirements(study: Study) -> list[str]:
+    """Return what [requirements] asks for, each in a few words; empty without that table."""
+    asked, unit = study.requirements, {"workspace": "mm", "joint": "rad", "time": "s"}[study.motion]
+    limits = (("largest sigma", asked.max_sigma_um, " µm"), ("images", asked.max_images, ""))
+    found = [f"{name} ≤ {limit:g}{of}" for name, limit, of in (*limits, ("tour", asked.max_tour, f" {unit}")) if limit]
+    return found + [f"U95 {item.from_} to {item.to} ≤ {item.u95_um:g} µm" for item in asked.distances]

@@ -13,13 +13,13 @@ corners with dh/dcorner at the end.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from netdesign.imaging.lens import ideal_pixels, measured_pixels
-from netdesign.imaging.pattern import FAST, blur, cover, further_box, kernel_reach, kernels
+from netdesign.imaging.pattern import blur, cover, further_box, kernel_reach, kernels
 from netdesign.imaging.tags import CELLS
 from netdesign.model.arrays import Floats
+from netdesign.model.compiled import FAST, entry
 
 UNKNOWNS = 14  # 8 of geometry, black, white, surround, light slope x and y, sigma
 SQUARE = np.array([[0.0, 0], [CELLS, 0], [CELLS, CELLS], [0, CELLS]])
@@ -70,7 +70,7 @@ def homography(corners: Floats) -> tuple[Floats, Floats]:
     return np.append(h, 1.0).reshape(3, 3), np.asarray(inverse * np.repeat(scale, 2))
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@entry(fastmath=FAST)
 def _normal_equations(
     picture: Floats, centres: Floats, model: Floats, px_from_tag: Floats, tag_from_px: Floats, px_from_ideal: Floats,
     levels: Floats, frame: Floats, noise: Floats, inside: NDArray[np.bool_], choose: bool, normal: Floats,

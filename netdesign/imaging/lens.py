@@ -4,17 +4,17 @@ Straight lines are straight in ideal pixels, so a tag is a homography there. Bro
 p2 is inverted by Newton's method; arrays in, arrays out.
 """
 
+from typing import Any
+
 import numpy as np
-from numba import njit
 
 from netdesign.model.arrays import Floats
+from netdesign.model.compiled import FAST, entry, part
 
-FAST = {"contract", "reassoc", "arcp", "nsz"}
 
-
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def _bend(x: float, y: float, k: Floats) -> tuple[float, float, float, float, float]:
-    """Return distorted (x, y) of ideal normalised (x, y) and the derivatives xx, xy (= yx), yy."""
+@part(fastmath=FAST)
+def _bend(x: Any, y: Any, k: Floats) -> tuple[Any, Any, Any, Any, Any]:
+    """Return distorted (x, y) of ideal normalised (x, y), numbers or arrays, and the derivatives xx, xy (= yx), yy."""
     k1, k2, p1, p2 = k[4], k[5], k[6], k[7]
     r2 = x * x + y * y
     radial, slope = 1.0 + r2 * (k1 + k2 * r2), 2.0 * (k1 + 2.0 * k2 * r2)
@@ -26,7 +26,7 @@ def _bend(x: float, y: float, k: Floats) -> tuple[float, float, float, float, fl
     return bent_x, bent_y, along_x, mixed, along_y
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@entry(fastmath=FAST)
 def ideal_pixels(xy_px: Floats, intrinsics: Floats) -> Floats:
     """Return ideal pixels (k, 2) of measured ones (k, 2); neighbours in the list start each other's search."""
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -52,10 +52,8 @@ def ideal_pixels(xy_px: Floats, intrinsics: Floats) -> Floats:
 
 def measured_pixels(ideal_px: Floats, intrinsics: Floats) -> tuple[Floats, Floats]:
     """Return measured pixels (k, 2) of ideal ones (k, 2) and their derivatives (k, 2, 2)."""
-    focal, centre = intrinsics[:2], intrinsics[2:4]
-    measured, derivative = np.empty_like(ideal_px), np.empty((len(ideal_px), 2, 2))
-    for index, (x, y) in enumerate((ideal_px - centre) / focal):
-        bent_x, bent_y, along_x, mixed, along_y = _bend(x, y, intrinsics)
-        measured[index] = focal * (bent_x, bent_y) + centre
-        derivative[index] = np.array([[along_x, mixed], [mixed, along_y]]) * focal[:, None] / focal[None, :]
+    fx, fy, cx, cy = intrinsics[:4]
+    bent_x, bent_y, along_x, mixed, along_y = _bend((ideal_px[:, 0] - cx) / fx, (ideal_px[:, 1] - cy) / fy, intrinsics)
+    measured = np.column_stack([fx * bent_x + cx, fy * bent_y + cy])
+    derivative = np.stack([along_x, mixed * fx / fy, mixed * fy / fx, along_y], axis=-1).reshape(-1, 2, 2)
     return measured, derivative

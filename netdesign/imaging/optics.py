@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from netdesign.model.camera import Camera
+from netdesign.model.compiled import FAST, entry
 
 Picture = NDArray[np.float32]
 
@@ -39,7 +39,7 @@ def margin_px(blur_px: float) -> int:
     return int(np.ceil(4.5 * blur_px)) + 1
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
+@entry(fastmath=FAST)
 def _decimate(
     fine: NDArray[Any], taps: NDArray[np.float32], supersample: int, first_row: int, scale: float, out: Picture
 ) -> None:

@@ -15,12 +15,11 @@ zone, and their sum weighted with the current grey levels, of which the derivati
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from netdesign.model.arrays import Floats
+from netdesign.model.compiled import FAST, entry, part
 
-FAST = {"contract", "reassoc", "arcp", "nsz"}
 LEANING = 4.0  # an edge that leans by 1/LEANING against the grid needs no smoothing: its place in the pixel changes
 
 
@@ -48,14 +47,14 @@ def kernels(sigma: float, per_pixel: int, reach: int, smoothed: float = 0.0) -> 
     return np.stack([np.convolve(row, box) for row in rows])
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@part(fastmath=FAST)
 def further_box(wide: float, narrow: float) -> float:
     """Return the width of the further boxes of an edge: ``wide`` on an edge along the grid, 0 on one that leans."""
     box = wide - LEANING * narrow
     return box if box > 0.05 * wide else 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@part(fastmath=FAST)
 def _once(t: float, wide: float, narrow: float) -> float:
     """Integral to t of the unit trapezoid that is flat to ±(wide - narrow)/2 and ends at ±(wide + narrow)/2."""
     outer = 0.5 * (wide + narrow)
@@ -72,7 +71,7 @@ def _once(t: float, wide: float, narrow: float) -> float:
     return 1.0 - tail if t > 0 else tail
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@part(fastmath=FAST)
 def _thrice(t: float, wide: float, narrow: float) -> float:
     """Third integral to t of that trapezoid."""
     outer, inner = 0.5 * (wide + narrow), 0.5 * (wide - narrow)
@@ -91,7 +90,7 @@ def _thrice(t: float, wide: float, narrow: float) -> float:
     return float(2.0 * middle + 0.5 * t * t - below)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@part(fastmath=FAST)
 def _smooth(t: float, wide: float, narrow: float, box: float) -> float:
     """Integral to t of that trapezoid convolved with two boxes of width ``box``."""
     if box == 0.0:
@@ -105,7 +104,7 @@ def _smooth(t: float, wide: float, narrow: float, box: float) -> float:
     return float(bent / (box * box))
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@part(fastmath=FAST)
 def _span(t: float, wide: float, narrow: float, box: float, shares: Floats) -> int:
     """Fill ``shares`` with the shares of a sub-pixel centred at t in consecutive cells; return the first cell."""
     first = int(np.floor(t - 0.5 * (wide + narrow) - box))
@@ -117,7 +116,7 @@ def _span(t: float, wide: float, narrow: float, box: float, shares: Floats) -> i
     return first
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@entry(fastmath=FAST)
 def cover(
     grid_x: Floats, grid_y: Floats, tag_from_px: Floats, cells: NDArray[np.uint8], h: float, layers: Floats
 ) -> None:
@@ -168,7 +167,7 @@ def cover(
             layers[1, r, c] = outside
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@entry(fastmath=FAST)
 def blur(
     layers: Floats, taps: Floats, per_pixel: int, black: float, white: float, surround: float, out: Floats
 ) -> None:

@@ -8,7 +8,6 @@ through a depth buffer with one sample per sub-pixel; where it stands in front o
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from netdesign.imaging.geometry import FACE_STEP_PX, distorted_vertices, divided, face_levels, part_triangles, tag_quads
@@ -17,6 +16,7 @@ from netdesign.imaging.optics import Picture, decimate
 from netdesign.imaging.tags import CELLS, QUIET_CELLS, cells
 from netdesign.model.arrays import Floats
 from netdesign.model.camera import Camera
+from netdesign.model.compiled import entry, part
 from netdesign.model.frames import transform
 from netdesign.model.scene import Scene
 
@@ -25,7 +25,7 @@ EDGE_STEP_PX = 3.0  # of an outline under distortion: a chord of 3 px is 0.0005 
 IN_FRONT = 5e-3  # share of the distance by which the part must be nearer than a tag to hide it
 
 
-@njit(cache=True, error_model="numpy")
+@part()
 def _add_edge(area: Floats, x0: float, y0: float, x1: float, y1: float, weight: float) -> None:
     """Add the signed area to the right of one edge; y downwards, coordinates in sub-pixels from the array's corner."""
     rows, columns = area.shape
@@ -64,7 +64,7 @@ def _add_edge(area: Floats, x0: float, y0: float, x1: float, y1: float, weight: 
         x, y = next_x, next_y
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def _add_outline(area: Floats, xy: Floats, weight: float) -> None:
     """Add the area of a closed polygon (k, 2); summing ``area`` along x afterwards gives the coverage."""
     for index in range(len(xy)):
@@ -72,7 +72,7 @@ def _add_outline(area: Floats, xy: Floats, weight: float) -> None:
         _add_edge(area, xy[index, 0], xy[index, 1], xy[following, 0], xy[following, 1], weight)
 
 
-@njit(cache=True, error_model="numpy")
+@entry()
 def _draw_triangles(xyz: Floats, level: Floats, light: NDArray[np.float32], inverse_depth: NDArray[np.float32]) -> None:
     """Draw triangles (t, 3, 3) of sub-pixel x, y and 1/depth; the largest 1/depth wins."""
     rows, columns = light.shape

@@ -40,6 +40,7 @@ QUARANTINE = {
     "markupsafe": ["reporting/"],
     "PIL": ["reporting/"],
     "distributed": ["cluster.py"],
+    "threadpoolctl": ["model/blas.py"],
 }
 EVERYWHERE = {"numpy", "scipy", "numba"}
 LONGEST = 300

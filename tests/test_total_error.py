@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from netdesign.model.frames import exp_rotation, look_at, pose
 from netdesign.photogrammetry.datum import inner_basis, point_null_space
@@ -61,6 +62,36 @@ def test_trace_kernel_equals_full_solution():
     assert one == pytest.approx(total_covariance(poses, points, INTRINSICS, visible, 0.1).trace, rel=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(40))
+def test_trace_kernel_finds_what_is_open_however_many_images(seed):
+    """Two halves that share up to four points, or an image that sees up to four: determined from three points on."""
+    rng = np.random.default_rng(seed)
+    images, count, shared = int(rng.integers(6, 41)), int(rng.integers(20, 100)), seed % 5
+    poses, points = relief(images, count, seed=seed)
+    visible = random_visibility(images, count, rng.uniform(0.5, 1.0), seed)
+    if seed % 2:
+        visible[: images // 2, count // 2 + shared :] = False
+        visible[images // 2 :, : count // 2] = False
+    else:
+        visible[0], visible[0, :shared] = False, True
+    sigma = np.array([[0.1]])
+    total = total_covariance(poses, points, INTRINSICS, visible, 0.1)
+    found = total_trace(poses, points, INTRINSICS, visible, sigma, inner_basis(points))
+    assert found == pytest.approx(total.trace if total.determined else np.inf, rel=1e-9)
+
+
+def test_trace_kernel_has_the_same_bits_on_any_number_of_blas_threads():
+    poses, points = relief(20, 150, seed=1)
+    visible = random_visibility(20, 150, 0.5)
+    arguments = poses, points, INTRINSICS, visible, np.array([[0.1]])
+    found = set()
+    for threads in (1, 2):
+        with threadpool_limits(threads, "blas"):
+            found.add((total_trace(*arguments, inner_basis(points)), block_trace(*arguments)))
+            assert {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"} == {threads}
+    assert len(found) == 1
+
+
 def test_functions_of_the_points_equal_the_joint_covariance():
     for seed in range(3):
         poses, points = relief(5 + seed, 30, seed=seed)
@@ -69,7 +100,7 @@ def test_functions_of_the_points_equal_the_joint_covariance():
         basis = inner_basis(points)
         functions = np.random.default_rng(seed).normal(size=(3 * len(points), 3))
         functions -= basis @ (basis.T @ functions)
-        found = propagated(poses, points, INTRINSICS, visible, np.array([[0.1]]), np.hstack([basis, functions]), False)
+        found = propagated(poses, points, INTRINSICS, visible, np.array([[0.1]]), np.hstack([basis, functions]))
         assert found[0] == pytest.approx(total.trace, rel=1e-9)
         np.testing.assert_allclose(found[1:], np.diag(functions.T @ total.joint() @ functions), rtol=1e-8)
 

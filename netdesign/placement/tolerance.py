@@ -85,7 +85,7 @@ class Load:
         visible, sigma = self.problem.visible(viewpoints), sighting_array(task, poses)
         values = np.zeros(0)
         if len(self.ends):
-            variances = propagated(poses, points, intrinsics, visible, sigma, self.functions, False)[1:]
+            variances = propagated(poses, points, intrinsics, visible, sigma, self.functions)[1:]
             values = COVERAGE_FACTOR * np.sqrt(variances)
         if len(self.names) > len(self.ends):
             covariance = direct_covariance(poses, points, intrinsics, visible, sigma)

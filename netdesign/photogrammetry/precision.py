@@ -27,7 +27,6 @@ import numpy as np
 from netdesign.model.arrays import Floats
 from netdesign.model.camera import Camera
 from netdesign.model.scene import Targets
-from netdesign.photogrammetry.collinearity import in_camera
 
 GREY_STEP = 215.0  # black to white of a printed tag in an 8-bit image
 EDGE_LEVEL = 90.0  # the level whose noise stands for an edge: below the middle, where the dark side weighs more
@@ -89,9 +88,13 @@ def sighting_sigma(camera: Camera, world_from_cam: Floats, targets: Targets) -> 
     if camera.corner_noise is None:
         return np.full((len(world_from_cam), 4 * len(targets.ids)), camera.sigma_px)
     points, normals = targets.points, targets.point_normals
-    depth = in_camera(world_from_cam[:, None], points[None])[..., 2]
-    ray = world_from_cam[:, None, :3, 3] - points[None]
-    cosine = np.einsum("nmi,mi->nm", ray, normals) / np.linalg.norm(ray, axis=-1)
+    # Coordinate by coordinate: the search calls this for every network.
+    ray = world_from_cam[:, :3, 3, None] - points.T[None]
+    axis = world_from_cam[:, :3, 2, None]
+    depth = -(ray[:, 0] * axis[:, 0] + ray[:, 1] * axis[:, 1] + ray[:, 2] * axis[:, 2])
+    distance = np.sqrt(ray[:, 0] ** 2 + ray[:, 1] ** 2 + ray[:, 2] ** 2)
+    nx, ny, nz = normals.T
+    cosine = (ray[:, 0] * nx + ray[:, 1] * ny + ray[:, 2] * nz) / distance
     focal = float(np.sqrt(camera.focal_px.prod()))
     edge = focal * targets.size_m / np.maximum(depth, 1e-9)
     return corner_sigma(camera, edge, np.arccos(np.clip(cosine, -1.0, 1.0)))

@@ -1,4 +1,4 @@
-"""The cache of compiled kernels: an edit of a part, of its file or of a constant, reaches every entry that uses it."""
+"""Compiled kernels: the cache notices every edit of a part, of its file or of a constant; numba stays as it was."""
 
 import os
 import subprocess
@@ -6,6 +6,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
+from numba import njit
+from numba.core.errors import TypingError
+from numba.core.target_extension import jit_registry
 
 from netdesign.model.compiled import entry, part
 from netdesign.placement.evaluation import excess, popcount
@@ -71,3 +75,30 @@ def test_a_part_is_the_same_function_from_python_and_compiled():
     for word in (0, 1, 2**63, 2**64 - 1, 0x0123456789ABCDEF):
         assert bits(np.uint64(word)) == word.bit_count()
     assert entry()(excess)(2.0, 1.0) == excess(2.0, 1.0) == 0.5
+
+
+def test_functions_of_numba_that_a_kernel_calls_serve_others_too():
+    @entry()
+    def ours(count):
+        values = np.zeros((count, 2), np.float32)
+        for index in range(count):
+            values[index, 1] = max(index, 3)
+        return values.sum()
+
+    @njit
+    def theirs(count):
+        values = np.zeros((count, 2), np.float32)
+        for index in range(count):
+            values[index, 1] = max(index, 3)
+        return values.sum()
+
+    @entry()
+    def wrong(count):
+        return np.zeros(count).no_such_thing()
+
+    before = dict(jit_registry)
+    assert ours(6) == theirs(6) == 3 * 4 + 4 + 5
+    with pytest.raises(TypingError):
+        wrong(3)
+    assert dict(jit_registry) == before
+    assert njit(lambda count: np.ones(count).sum())(5) == 5.0

@@ -4,6 +4,9 @@ An ``entry`` is called from Python: compiled for the types that it meets and kep
 entries: it becomes machine code inside them only, which halves what a first run has to compile. Called from Python a
 part is plain Python, slow and right.
 
+Numba's own functions that a kernel calls (``empty``, ``max``) are parts as well: by default each is optimised and made
+executable by itself, once for every set of options, wrappers for Python and C included.
+
 Numba keeps an entry until its own file changes. Here the key also holds every file whose parts and entries it calls,
 and the constants it reads, so that an edit anywhere in a kernel is never answered by yesterday's machine code.
 """
@@ -16,9 +19,10 @@ from types import CodeType, SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import jit, njit
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
+from numba.core.compiler import Compiler, Flags
+from numba.core.target_extension import jit_registry, target_registry
 from numba.extending import register_jitable
 
 Function = Callable[..., Any]
@@ -117,16 +121,62 @@ class _PartLibrary(_EntryLibrary):
         self._finalized = True
 
 
+class _Flags(Flags):
+    """Options of a kernel; what it calls inherits only those that matter to it.
+
+    Numba keeps an ``empty`` or ``max`` for every set of options that it was compiled under, wrappers and threads
+    included, and compares sixty options for every function that a call might mean.
+    """
+
+    __slots__ = ()
+
+    def copy(self) -> Flags:
+        """Return what is inherited, one object for each choice of them."""
+        inherited = _Flags()
+        for name in ("nrt", "fastmath", "error_model"):
+            setattr(inherited, name, getattr(self, name))
+        return _inherited.setdefault(inherited.summary(), inherited)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or super().__eq__(other)
+
+    def __hash__(self) -> int:
+        return _HASH
+
+
+_HASH = hash(Flags())  # numba's hash does not look at the values
+_inherited: dict[str, Flags] = {}
+
+
 class _EntryCompiler(Compiler):
-    """Numba's compiler with a library of ours."""
+    """Numba's compiler with a library of ours; numba's own functions that a kernel calls become parts of it."""
 
     library = _EntryLibrary
 
     def __init__(self, typingctx, targetctx, library, args, return_type, flags, locals):  # type: ignore[no-untyped-def]
         own = self.library(targetctx.codegen(), "kernel")
         own.enable_object_caching()
-        super().__init__(typingctx, targetctx, own, args, return_type, flags, locals)
+        super().__init__(typingctx, targetctx, own, args, return_type, _Flags(flags), locals)
+
+    def _compile_core(self) -> Any:
+        cpu, codegen = target_registry["cpu"], self.state.targetctx.codegen()
+        if jit_registry[cpu] is _part_of_numba:
+            return super()._compile_core()
+        jitter = jit_registry.pop(cpu)
+        jit_registry[cpu] = _part_of_numba
+        codegen.create_library = lambda name: _PartLibrary(codegen, name)
+        try:
+            return super()._compile_core()
+        finally:
+            del jit_registry[cpu]
+            jit_registry[cpu] = jitter
+            del codegen.create_library
 
 
 class _PartCompiler(_EntryCompiler):
     library = _PartLibrary
+
+
+def _part_of_numba(**options: Any) -> Any:
+    """Return numba's decorator of an overload."""
+    return jit(**{"pipeline_class": _PartCompiler, "no_cfunc_wrapper": True, **options})

@@ -9,9 +9,10 @@ from pymoo.util.nds.non_dominated_sorting import NonDominatedSorting
 
 from netdesign.errors import InputError
 from netdesign.search.archive import non_dominated, staircases
-from netdesign.search.engine import hypervolume, run
+from netdesign.search.engine import hypervolume, offspring, run
 from netdesign.search.operators import polynomial_mutation, sbx
-from netdesign.search.selection import constrained_ranks, crowding
+from netdesign.search.population import evaluated, joined
+from netdesign.search.selection import constrained_ranks, crowding, ranked, tournament
 from netdesign.search.state import load, save
 
 
@@ -94,6 +95,48 @@ def test_operators_keep_bounds_and_means():
     mutants = polynomial_mutation(rng, first, lower, upper, 1.0, 20)
     assert ((mutants >= lower) & (mutants <= upper)).all()
     assert 0.02 < (np.abs(mutants - first) / (upper - lower)).mean() < 0.1
+
+
+@given(st.integers(0, 10**6), st.integers(2, 30), st.integers(1, 90))
+@settings(deadline=None, max_examples=40)
+def test_everybody_competes_equally_often(seed, members, count):
+    """With ranks that all differ, nobody wins more tournaments than it can enter, and the best wins all of its own."""
+    rng = np.random.default_rng(seed)
+    rounds = 2 * count // members  # whole permutations
+    winners = tournament(rng, rng.permutation(members), np.zeros(members), count)
+    wins = np.bincount(winners, minlength=members)
+    assert len(winners) == count
+    assert wins.max() <= -(-2 * count // members)
+    assert (wins == 0).sum() >= 1 or rounds == 0
+    if members % 2 == 0 and 2 * count % members == 0:
+        ranks = rng.permutation(members)
+        wins = np.bincount(tournament(rng, ranks, np.zeros(members), count), minlength=members)
+        assert wins[ranks.argmin()] == rounds
+        assert wins[ranks.argmax()] == 0
+
+
+def test_no_child_is_a_copy():
+    """Half of what this problem breeds are copies of the parents; the population gets none, unless nothing else exists."""
+
+    class Lazy(Dots):
+        def vary_plain(self, rng, first, second):
+            bits, genes = super().vary_plain(rng, first, second)
+            copied = rng.random(len(bits)) < 0.5
+            both = np.concatenate([first.bits, second.bits]), np.concatenate([first.genes, second.genes])
+            return np.where(copied[:, None], both[0], bits), np.where(copied[:, None, None], both[1], genes)
+
+    class Barren(Dots):
+        def vary_plain(self, rng, first, second):
+            return np.concatenate([first.bits, second.bits]), np.concatenate([first.genes, second.genes])
+
+    rng = np.random.default_rng(0)
+    for problem, copies in ((Lazy(), 0), (Barren(), 20)):
+        population = evaluated(problem.evaluate, *problem.random(rng, 20))
+        children = offspring(rng, problem, population, *ranked(population), problem.vary_plain)
+        together = joined([population, children])
+        rows = np.concatenate([together.bits, together.genes[..., 0]], axis=1)
+        assert len(children) == 20
+        assert len(rows) - len(np.unique(rows, axis=0)) == copies
 
 
 class Dots:

@@ -3,27 +3,31 @@
 Both count their budget in evaluations, population x generations, and draw every random number from one generator
 outside the evaluation: a seed gives one result, whatever the number of threads and however often it was stopped.
 
-* ``nsga2``: tournaments, uniform and SBX crossover, bit-flip and polynomial mutation, elitist survival.
+* ``nsga2``: tournaments, uniform and SBX crossover, bit-flip and polynomial mutation, elitist survival, no copies.
 * ``memetic``: starts from seeds (set cover), spends a fifth of the generations (at most 60) on NSGA-II with operators
   that know what a gene means, then improves members of the archive one gene at a time until the budget is used.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import lru_cache
 from typing import Literal
 
 import moocore
 import numpy as np
+from numpy.typing import NDArray
 
 from netdesign.errors import InputError
 from netdesign.search.archive import empty_archive
-from netdesign.search.population import Floats, Ints, Population, SearchProblem, Vary, evaluated, joined
+from netdesign.search.population import Bools, Floats, Ints, Population, SearchProblem, Vary, evaluated, joined
 from netdesign.search.selection import ranked, survive, tournament
 from netdesign.search.state import State, generator_state, restored_generator
 
 Engine = Literal["memetic", "nsga2"]
 
 GENETIC_SHARE, GENETIC_MOST = 0.2, 60
+BREEDINGS = 20  # rounds of breeding that may replace copies
+SPARE = 4  # per cent of pairs that breed beyond need, in place of copies: cheaper than another round
 BATCH = 8  # members improved between two updates of the archive
 
 OnStep = Callable[[State], None]
@@ -98,11 +102,40 @@ def steps(problem: SearchProblem, engine: Engine, state: State, population: int,
 def offspring(
     rng: np.random.Generator, problem: SearchProblem, population: Population, ranks: Ints, crowding: Floats, vary: Vary
 ) -> Population:
-    """Return as many evaluated children as there are parents, which win tournaments by rank and crowding (P,)."""
-    parents = tournament(rng, ranks, crowding, len(population) + len(population) % 2)
-    half = len(parents) // 2
-    bits, genes = vary(rng, population.take(parents[:half]), population.take(parents[half:]))
+    """Return as many evaluated children as there are parents, which win tournaments by rank and crowding (P,).
+
+    A child that is a copy of a member or of another child would cost an evaluation and crowd out a network that
+    differs: other parents breed in its place.
+    """
+    count = len(population)
+    known = _fingerprints(population.bits, population.genes)
+    bits, genes = population.bits[:0], population.genes[:0]
+    for attempt in range(BREEDINGS):
+        pairs = (count - len(bits) + 1) // 2
+        pairs += SPARE * pairs // 100 + 1
+        parents = tournament(rng, ranks, crowding, 2 * pairs)
+        new_bits, new_genes = vary(rng, population.take(parents[0::2]), population.take(parents[1::2]))
+        if attempt < BREEDINGS - 1:  # a space of few chromosomes may have no others
+            both = np.concatenate([known, _fingerprints(new_bits, new_genes)])
+            first = np.unique(both, return_index=True)[1]
+            fresh = np.sort(first[first >= len(known)]) - len(known)
+            new_bits, new_genes, known = new_bits[fresh], new_genes[fresh], both
+        bits, genes = np.concatenate([bits, new_bits])[:count], np.concatenate([genes, new_genes])[:count]
+        if len(bits) == count:
+            break
     return evaluated(problem.evaluate, bits, genes)
+
+
+def _fingerprints(bits: Bools, genes: Floats) -> NDArray[np.uint64]:
+    """A hash (P,) of 64 bits per chromosome: equal for equal ones, and by chance never for others."""
+    words = np.concatenate([np.ascontiguousarray(genes).reshape(len(genes), -1).view(np.uint64), bits], axis=1)
+    words ^= words >> np.uint64(32)  # the high bits of a float change seldom, the low ones of a product carry no others
+    return np.asarray((words * _factors(words.shape[1])).sum(axis=1, dtype=np.uint64))
+
+
+@lru_cache
+def _factors(count: int) -> NDArray[np.uint64]:
+    return np.random.default_rng(0).integers(0, 1 << 63, count, dtype=np.uint64) * 2 + 1
 
 
 def _picks(rng: np.random.Generator, state: State) -> Population:

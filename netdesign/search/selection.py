@@ -66,8 +66,13 @@ def survive(population: Population, size: int) -> tuple[Population, Ints, Floats
 
 
 def tournament(rng: np.random.Generator, ranks: Ints, distance: Floats, count: int) -> Ints:
-    """Return ``count`` winners of binary tournaments: lower front, then larger crowding distance, then chance."""
-    pairs = rng.integers(0, len(ranks), (count, 2))
+    """Return ``count`` winners of binary tournaments: lower front, then larger crowding distance, then chance.
+
+    The pairs are read off random permutations, as in Deb's program: everybody competes equally often. Pairs drawn
+    independently leave a seventh of the population out of two rounds, which costs measurably on ZDT1 and ZDT2.
+    """
+    entrants = np.tile(np.arange(len(ranks)), (-(-2 * count // len(ranks)), 1))
+    pairs = rng.permuted(entrants, axis=1).ravel()[: 2 * count].reshape(count, 2)
     coin = rng.random(count) < 0.5
     one, two = pairs[:, 0], pairs[:, 1]
     better = (ranks[one] < ranks[two]) | ((ranks[one] == ranks[two]) & (distance[one] > distance[two]))

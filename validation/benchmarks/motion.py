@@ -5,7 +5,8 @@ fixed roll every branch of the arm is an option at every station, with a free on
 how far the search's quick tours are above the exact optimum over order and options, for eight stations.
 """
 
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Iterator
 
 import numpy as np
 from numba import njit
@@ -16,6 +17,7 @@ from netdesign.motion.joint_tour import law_of, network_tour, search_work_for
 from netdesign.motion.tour import path_length
 from netdesign.placement.evaluation import JointTables, joint_tours, write_direction
 from tests.cells import joint_map, reachable_viewpoints
+from validation.benchmarks.table import Row
 
 NETWORKS, STATIONS = 1000, 10
 EXACT, EXACT_STATIONS = 100, 8
@@ -33,12 +35,8 @@ def _workspace(genes, objectives):
         objectives[p, 1] = path_length(directions)
 
 
-def lines(
-    cpu: Callable[[Callable[[], object], int], list[float]],
-    ratio: Callable[[list[float], list[float]], str],
-    repeats: int,
-) -> Iterator[str]:
-    """Yield one line per camera mount, kind of roll and law."""
+def rows(repeats: int) -> Iterator[Row]:
+    """Yield the rows of every camera mount, kind of roll and law."""
     bits = np.ones((NETWORKS, STATIONS), dtype=np.bool_)
     objectives, violation = np.zeros((NETWORKS, 3)), np.zeros(NETWORKS)
     for mount, roll in CASES:
@@ -48,20 +46,20 @@ def lines(
         name = f"{mount}, roll {'free' if roll is None else 'fixed'}"
         for timed in (False, True):
             tables = JointTables(of_map.arrays, law, timed, 0.5, np.inf)
-            workspace: list[float] = []
-            joint: list[float] = []
-            for _ in range(repeats):  # side by side: the load of the machine meets both
-                workspace += cpu(lambda genes=genes: _workspace(genes, objectives), 1)
-                joint += cpu(
-                    lambda genes=genes, tables=tables: joint_tours(bits, genes, tables, objectives, violation), 1
-                )
+            pairs = []
+            for repeat in range(repeats + 1):  # side by side: the load of the machine meets both
+                start = time.process_time()
+                _workspace(genes, objectives)
+                middle = time.process_time()
+                joint_tours(bits, genes, tables, objectives, violation)
+                if repeat > 0:
+                    pairs.append((middle - start, time.process_time() - middle))
             if violation.any():
                 raise RuntimeError(f"{name}: expected stations that can be reached")
-            rate = NETWORKS * STATIONS / float(np.median(joint))
-            what = "time " if timed else "joint"
-            yield f"{what} objective, {name:20} viewpoints/s, to workspace's (>= 0.25) {ratio(workspace, joint)}"
-            yield f"{what} objective, {name:20} viewpoints/s (>= 100000)              {rate:10.0f}"
-        yield f"search tours above the exact optimum, {name:20} n = 8, mean {_above(of_map, law):17.2%}"
+            what = f"{'time' if timed else 'joint'} objective, {name}"
+            yield Row(f"{what}: speed relative to the workspace's", 0.25, [near / far for near, far in pairs])
+            yield Row(f"{what}: viewpoints a second", 1e5, [NETWORKS * STATIONS / far for _, far in pairs])
+        yield Row(f"search tours in joints, {name}, n = 8: mean length over the exact", None, [1.0 + _above(of_map, law)])
 
 
 def _above(of_map, law) -> float:

@@ -59,7 +59,7 @@ def rows(repeats: int) -> Iterator[Row]:
             what = f"{'time' if timed else 'joint'} objective, {name}"
             yield Row(f"{what}: speed relative to the workspace's", 0.25, [near / far for near, far in pairs])
             yield Row(f"{what}: viewpoints a second", 1e5, [NETWORKS * STATIONS / far for _, far in pairs])
-        yield Row(f"search tours in joints, {name}, n = 8: mean length over the exact", None, [1.0 + _above(of_map, law)])
+        yield Row(f"search tours in joints, {name}, n = 8, over the exact", None, [1.0 + _above(of_map, law)])
 
 
 def _above(of_map, law) -> float:

@@ -116,7 +116,7 @@ def test_everybody_competes_equally_often(seed, members, count):
 
 
 def test_no_child_is_a_copy():
-    """Half of what this problem breeds are copies of the parents; the population gets none, unless nothing else exists."""
+    """Half of what is bred here are copies of the parents; none is kept, unless nothing else exists."""
 
     class Lazy(Dots):
         def vary_plain(self, rng, first, second):

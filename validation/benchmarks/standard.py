@@ -73,6 +73,6 @@ def rows(seeds: int) -> Iterator[Row]:
             f"NSGA-II on {name.upper()}, {seeds} seeds: hypervolume in pymoo's range",
             0.0,
             place.tolist(),
-            f"ours {np.median(mine):.4f} ({mine.min():.4f} to {mine.max():.4f}); pymoo {np.median(others):.4f} ({low:.4f} to"
-            f" {high:.4f}); closed form {exact:.4f}",
+            f"ours {np.median(mine):.4f} ({mine.min():.4f} to {mine.max():.4f});"
+            f" pymoo {np.median(others):.4f} ({low:.4f} to {high:.4f}); closed form {exact:.4f}",
         )

@@ -31,6 +31,7 @@ REASONS = (
 _FIELD_CELLS = 96
 _FIELD_PAD = 0.10
 _SHORTEST_STEP = 5e-4
+_AT_ONCE = 32  # configurations of a leg
 
 
 class Body(NamedTuple):
@@ -254,23 +255,16 @@ def states(body, joints):  # type: ignore[no-untyped-def]
     return out
 
 
-@entry()
-def leg_state(body, start, end, step):  # type: ignore[no-untyped-def]
+def leg_state(body: Body, start: Floats, end: Floats, step: float) -> int:
     """Return the first state that is not FREE on the straight joint line, ends included; the view may be blocked.
 
     Joints (r,); ``step`` rad is the largest change of any joint between two tests.
     """
-    r = start.shape[0]
-    links, placed = np.empty((r, 3, 4)), np.empty((body.capsules.shape[0], 6))
-    widest = 0.0
-    for i in range(r):
-        widest = max(widest, abs(end[i] - start[i]))
-    count = math.ceil(widest / step) + 1
-    q = np.empty(r)
-    for k in range(count + 1):
-        for i in range(r):
-            q[i] = start[i] + (end[i] - start[i]) * (k / count)
-        state = configuration_state(body, q, links, placed)
-        if state != FREE and state != SIGHT:
-            return state
+    count = math.ceil(np.abs(end - start).max() / step) + 1
+    for first in range(0, count + 1, _AT_ONCE):
+        share = np.arange(first, min(first + _AT_ONCE, count + 1)) / count
+        found = states(body, start + (end - start) * share[:, None])
+        touching = found[(found != FREE) & (found != SIGHT)]
+        if len(touching):
+            return int(touching[0])
     return FREE

@@ -110,7 +110,6 @@ class Work(NamedTuple):
     trial: Any
 
 
-@entry()
 def work_for(n, r, most):  # type: ignore[no-untyped-def]
     """Return scratch for n stations of at most ``most`` options of r joints."""
     wide = (max(n, most) + LANES - 1) // LANES * LANES
@@ -202,7 +201,7 @@ def joint_tour(options, count, label, barred, law, timed, tour, rounds, work):  
     return best
 
 
-@entry()
+@part()
 def directions_tour(directions):  # type: ignore[no-untyped-def]
     """Return the closed tour (n + 1,), dummy in front, that goes from unit direction (n, 3) to nearest direction."""
     n = directions.shape[0]
@@ -233,7 +232,6 @@ class SearchWork(NamedTuple):
     barred: Any
 
 
-@entry()
 def search_work_for(arrays, n):  # type: ignore[no-untyped-def]
     """Return scratch of ``network_tour`` for up to n viewpoints over a map: of its own, and the tour's."""
     r = arrays.joints.shape[4]

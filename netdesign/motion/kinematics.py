@@ -220,7 +220,8 @@ def solve_restarts(placements, last_from_flange, lower, upper, wraps, free, targ
 
 def base_from_flange(chain: Chain, joints: Floats) -> Floats:
     """Return the flange poses (n, 4, 4) m of joints (n, r) rad."""
-    return np.asarray(forward(chain.placements, chain.last_from_flange, np.ascontiguousarray(joints, dtype=np.float64)))
+    joints = np.ascontiguousarray(joints, dtype=np.float64)  # writable, as a Body's: compiled once for both
+    return np.asarray(forward(np.array(chain.placements), np.array(chain.last_from_flange), joints))
 
 
 def restarts(chain: Chain, count: int, seed: int = 0) -> Floats:

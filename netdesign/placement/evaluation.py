@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.compiled import FAST, entry, part
 from netdesign.model.scene import CORNERS_PER_TAG
-from netdesign.motion.joint_tour import network_tour, search_work_for
-from netdesign.motion.tour import path_length
+from netdesign.motion.joint_tour import SearchWork, Work, network_tour, search_work_for
+from netdesign.motion.tour import heuristic_length
 from netdesign.photogrammetry.limited_error import LANES, add_four_cameras, variances_from_moments
 from netdesign.placement.visibility_map import cell_index
 
@@ -36,7 +36,7 @@ class SphereTables(NamedTuple):
         variance: m² per unit of the moment form, sigma² / f².
         min_rays, min_tags: images per tag, tags per image.
         criterion: MEAN_VARIANCE or MAX_SIGMA.
-        in_joints: f2 comes from :func:`joint_tours`.  longest: admissible workspace f2.
+        longest: admissible workspace f2.
         limits: (4,) lowest and highest azimuth, lowest and highest elevation, rad.
         fixed: the first images of every network, which stay where they are.
     """
@@ -53,7 +53,6 @@ class SphereTables(NamedTuple):
     min_rays: int
     min_tags: int
     criterion: int
-    in_joints: bool
     longest: float
     limits: Floats
     fixed: int = 0
@@ -177,15 +176,18 @@ def excess(length: float, longest: float) -> float:
     return max(0.0, 1.0 - longest / length) if length > 0.0 else 0.0
 
 
-@entry(nogil=True)
 def joint_tours(bits: Bools, genes: Floats, joint: JointTables, objectives: Floats, violation: Floats) -> None:
-    """Replace f2 of the feasible rows by the joint-space tour and add the stations out of reach to their violation.
+    """Replace f2 of the feasible rows by the joint-space tour and add the stations out of reach to their violation."""
+    _joint_tours(bits, genes, joint, *search_work_for(joint.arrays, bits.shape[1]), objectives, violation)
 
-    Apart from :func:`evaluate_networks`: compiled into it, the tour over joint options would take half as long again.
-    """
+
+@entry(nogil=True)
+def _joint_tours(
+    bits: Bools, genes: Floats, joint: JointTables, own: SearchWork, work: Work, objectives: Floats, violation: Floats
+) -> None:
+    """Apart from :func:`evaluate_networks`: compiled into it, the tour over options would take half as long again."""
     count, slots = bits.shape
     viewpoints = np.zeros((slots, 2))
-    own, work = search_work_for(joint.arrays, slots)
     for p in range(count):
         if violation[p] > 0:
             continue
@@ -203,7 +205,7 @@ def joint_tours(bits: Bools, genes: Floats, joint: JointTables, objectives: Floa
 def evaluate_networks(bits: Bools, genes: Floats, tables: SphereTables, objectives: Floats, violation: Floats) -> None:
     """Write objectives (P, 3) and violation (P,) of chromosomes: bits (P, n), genes (P, n, 2) = (alpha, beta) rad.
 
-    f2 is the workspace tour, or left at 0 when ``tables.in_joints``: :func:`joint_tours` follows then.
+    f2 is 0, or inf where a sighting is missing: :func:`workspace_tours` or :func:`joint_tours` follows.
     """
     count, slots = bits.shape
     blocks = len(tables.points) // (3 * LANES)
@@ -228,7 +230,24 @@ def evaluate_networks(bits: Bools, genes: Floats, tables: SphereTables, objectiv
             violation[p] = 1.0 + lacking  # always worse than a tour that is too long
             continue
         write_moments(viewpoints[:k], directions, cells, tables, weights, four, moments)
-        weak = variances_from_moments(moments, tables.points, tables.radius, tables.point_count, variances)
-        length = 0.0 if tables.in_joints else tables.radius * path_length(directions[:k])
-        objectives[p, 0], objectives[p, 1] = precision_objective(variances, tables), length
-        violation[p] = weak + excess(length, tables.longest)
+        violation[p] = variances_from_moments(moments, tables.points, tables.radius, tables.point_count, variances)
+        objectives[p, 0], objectives[p, 1] = precision_objective(variances, tables), 0.0
+
+
+@entry(nogil=True)
+def workspace_tours(
+    bits: Bools, genes: Floats, radius: float, longest: float, objectives: Floats, violation: Floats
+) -> None:
+    """Replace f2 of the rows without missing sightings by the workspace tour; add what is beyond the longest."""
+    count, slots = bits.shape
+    directions = np.zeros((slots, 3))
+    for p in range(count):
+        if objectives[p, 1] == np.inf:
+            continue
+        k = 0
+        for slot in range(slots):
+            if bits[p, slot]:
+                write_direction(genes[p, slot, 0], genes[p, slot, 1], directions[k])
+                k += 1
+        objectives[p, 1] = radius * heuristic_length(directions[:k])
+        violation[p] += excess(objectives[p, 1], longest)

@@ -62,7 +62,6 @@ def sphere_tables(task: Task, visibility: VisibilityMap) -> SphereTables:
         min_rays=limits.min_rays,
         min_tags=max(1, -(-limits.min_points_per_image // CORNERS_PER_TAG)),
         criterion=MAX_SIGMA if task.study.objectives.precision == "max_sigma" else MEAN_VARIANCE,
-        in_joints=task.study.motion != "workspace",
         longest=np.inf if longest is None or task.study.motion != "workspace" else 1e-3 * longest,
         limits=np.array([*sphere.azimuth, *sphere.elevation]),
     )

@@ -20,6 +20,7 @@ from netdesign.placement.evaluation import (
     SphereTables,
     evaluate_networks,
     joint_tours,
+    workspace_tours,
 )
 from netdesign.placement.local_search import ADD, MOVE, REMOVE, Tries, improve_networks
 from netdesign.placement.network_problem import ADDITIONS, MOVES, REMOVALS, TELEPORTS, NetworkProblem
@@ -101,6 +102,11 @@ class Problem(NetworkProblem):
         def part(start: int) -> None:
             rows = slice(start, start + CHUNK)
             evaluate_networks(bits[rows], genes[rows], self.tables, objectives[rows], violation[rows])
+            if self.joint is None:
+                tables = self.tables
+                workspace_tours(
+                    bits[rows], genes[rows], tables.radius, tables.longest, objectives[rows], violation[rows]
+                )
 
         self._share_out(part, range(0, len(bits), CHUNK))
         self._drive(bits, genes, objectives, violation)
@@ -134,7 +140,7 @@ class Problem(NetworkProblem):
         """Return f1 of the limited propagation and violation, whatever the tour and the criterion's propagation."""
         bits, genes = self._with_pinned(bits, genes)
         objectives, violation = np.empty((len(bits), 3)), np.empty(len(bits))
-        evaluate_networks(bits, genes, self.tables._replace(in_joints=True), objectives, violation)
+        evaluate_networks(bits, genes, self.tables, objectives, violation)
         return objectives[:, 0], violation
 
     def candidates(self) -> Floats:

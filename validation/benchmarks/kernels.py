@@ -63,7 +63,7 @@ class Sides:
             points=blocked(self.points.T), point_count=POINTS, tags=tags, radius=RADIUS, grid=np.zeros(6), sure=bits,
             weight=np.ones((1, POINTS + -POINTS % 16)), weight_grid=np.zeros(6),
             variance=(SIGMA / FOCAL) ** 2, min_rays=2, min_tags=1,
-            criterion=0, in_joints=False, longest=np.inf, limits=np.zeros(4),
+            criterion=0, longest=np.inf, limits=np.zeros(4),
         )  # fmt: skip
         self.seen, self.out = np.repeat(seen, 4, axis=1), np.zeros(NETWORKS)
         self.textbook_share = NETWORKS / TEXTBOOK

@@ -23,7 +23,7 @@ import numpy as np
 from netdesign.model.arrays import Floats
 from netdesign.model.compiled import FAST, entry, part
 from netdesign.motion.cell import ArmCell
-from netdesign.motion.joint_lookup import LANES, options_of
+from netdesign.motion.joint_lookup import LANES, MapArrays, options_of
 from netdesign.motion.tour import _improve
 
 NO_TURN = 1e9
@@ -110,7 +110,7 @@ class Work(NamedTuple):
     trial: Any
 
 
-def work_for(n, r, most):  # type: ignore[no-untyped-def]
+def work_for(n: int, r: int, most: int) -> Work:
     """Return scratch for n stations of at most ``most`` options of r joints."""
     wide = (max(n, most) + LANES - 1) // LANES * LANES
     return Work(
@@ -232,7 +232,7 @@ class SearchWork(NamedTuple):
     barred: Any
 
 
-def search_work_for(arrays, n):  # type: ignore[no-untyped-def]
+def search_work_for(arrays: MapArrays, n: int) -> tuple[SearchWork, Work]:
     """Return scratch of ``network_tour`` for up to n viewpoints over a map: of its own, and the tour's."""
     r = arrays.joints.shape[4]
     own = SearchWork(

@@ -158,8 +158,7 @@ def _improve(D: Floats, t: Ints, P: Floats) -> float:
     _two_opt(D, t, threshold)
     while len(t) > 4 and _three_opt_move(D, t, P, threshold):
         _two_opt(D, t, threshold)
-    length: float = _length(D, t)
-    return length
+    return float(_length(D, t))
 
 
 @entry()
@@ -178,7 +177,7 @@ def nearest_neighbour_3opt(distance: Floats) -> tuple[Ints, float]:
 @entry()
 def path_length(positions: Floats) -> float:
     """Return the length of the heuristic path over positions (n, d), Euclidean distances."""
-    return heuristic_length(positions)
+    return float(heuristic_length(positions))
 
 
 @part()
@@ -194,8 +193,7 @@ def heuristic_length(positions: Floats) -> float:
             D[a + 1, b + 1] = D[b + 1, a + 1] = np.sqrt(square)
     if n < 2:
         return 0.0
-    length: float = _improve(D, _nearest_neighbour(D, 1), np.empty((n + 1, n + 2)))
-    return length
+    return float(_improve(D, _nearest_neighbour(D, 1), np.empty((n + 1, n + 2))))
 
 
 @entry()

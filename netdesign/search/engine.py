@@ -1,6 +1,7 @@
 """The engines: NSGA-II as in the source paper, and the memetic search that is the default.
 
-Both count their budget in evaluations, population x generations, and draw every random number from one generator
+Both count their budget in evaluations, population x generations (what the seeds take before the first generation, f1 of
+some thousand networks of a few stations for each size, is not in it), and draw every random number from one generator
 outside the evaluation: a seed gives one result, whatever the number of threads and however often it was stopped.
 
 * ``nsga2``: tournaments, uniform and SBX crossover, bit-flip and polynomial mutation, elitist survival, no copies.
@@ -28,7 +29,7 @@ Engine = Literal["memetic", "nsga2"]
 GENETIC_SHARE, GENETIC_MOST = 0.2, 60
 BREEDINGS = 20  # rounds of breeding that may replace copies
 SPARE = 4  # per cent of pairs that breed beyond need, in place of copies: cheaper than another round
-BATCH = 8  # members improved between two updates of the archive
+FEWEST_PICKS, MOST_PICKS = 8, 32  # members improved between two updates of the archive, a sixth of the population
 
 OnStep = Callable[[State], None]
 
@@ -93,7 +94,7 @@ def steps(problem: SearchProblem, engine: Engine, state: State, population: int,
             archive = state.archive.with_rows(children)
             state = replace(state, population=survivors, ranks=ranks, crowding=crowding, archive=archive)
         else:
-            children = problem.improve(rng, _picks(rng, state))
+            children = problem.improve(rng, _picks(rng, state, population))
             state = replace(state, archive=state.archive.with_rows(children))
         state = _noted(problem, replace(state, step=state.step + 1), rng, len(children))
         yield state
@@ -138,12 +139,13 @@ def _factors(count: int) -> NDArray[np.uint64]:
     return np.random.default_rng(0).integers(0, 1 << 63, count, dtype=np.uint64) * 2 + 1
 
 
-def _picks(rng: np.random.Generator, state: State) -> Population:
+def _picks(rng: np.random.Generator, state: State, population: int) -> Population:
     """Members for the local search: a size at random, then one of its members, so that no size is neglected."""
+    count = min(MOST_PICKS, max(FEWEST_PICKS, population // 6))
     sizes: Ints = state.archive.sizes
     different, starts, counts = np.unique(sizes, return_index=True, return_counts=True)
-    layer = rng.integers(0, len(different), BATCH)
-    rows = starts[layer] + np.floor(rng.random(BATCH) * counts[layer]).astype(np.int64)
+    layer = rng.integers(0, len(different), count)
+    rows = starts[layer] + np.floor(rng.random(count) * counts[layer]).astype(np.int64)
     return state.archive.members.take(rows)
 
 

@@ -26,8 +26,12 @@ from validation.benchmarks.table import Row
 IMAGES, POPULATION, GENERATIONS, SLICE = 30, 200, 500, 20
 
 
-def box_problem() -> Problem:
-    """Return the benchmark's study: five faces of a box, at least two rays per point, motion in the workspace."""
+def box_problem(images: int = IMAGES, spacing: float = 0.06, tag_size: float = 0.02) -> Problem:
+    """Return the benchmark's study: five faces of a box, at least two rays per point, motion in the workspace.
+
+    Args:
+        images: at most.  spacing: m between the tags; 0.06 makes 50.  tag_size: m.
+    """
     study = Study.model_validate(
         {
             "format": 1,
@@ -35,13 +39,13 @@ def box_problem() -> Problem:
             "part": {"mesh": "none"},
             "targets": {"size_mm": 20, "spacing_mm": 50},
             "camera": {"width_px": 1, "height_px": 1, "focal_px": [1, 1], "principal_point_px": [0, 0]},
-            "viewpoints": {"radius_mm": 600, "max_images": IMAGES},
+            "viewpoints": {"radius_mm": 600, "max_images": images},
         }
     )
-    scene = box_scene(spacing=0.06)
+    scene = box_scene(spacing=spacing, tag_size=tag_size)
     limits = replace(LIMITS, min_rays=2)
     task = Task(
-        study=study, scene=scene, camera=CAMERA, sphere=sphere(max_images=IMAGES), limits=limits, cell=None, sha256=""
+        study=study, scene=scene, camera=CAMERA, sphere=sphere(max_images=images), limits=limits, cell=None, sha256=""
     )
     return replace(Problem.build(task), threads=1)
 

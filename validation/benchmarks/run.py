@@ -20,7 +20,7 @@ import numba
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the scene, and the package of this checkout
 
-from validation.benchmarks import engines, kernels, motion, quality, standard, startup, total
+from validation.benchmarks import engines, kernels, motion, quality, scaling, standard, startup, total
 from validation.benchmarks.table import Row, store
 
 
@@ -82,6 +82,7 @@ PARTS: dict[str, Callable[[int, bool], Iterator[Row]]] = {
     "engines": lambda repeats, long: engines.rows(long),
     "quality": lambda repeats, long: quality.rows(long),
     "startup": lambda repeats, long: startup.rows(repeats),
+    "scaling": lambda repeats, long: scaling.rows(repeats),
     "standard": lambda repeats, long: standard.rows(10 if long else 3),
 }
 

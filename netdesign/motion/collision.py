@@ -31,6 +31,7 @@ REASONS = (
 _FIELD_CELLS = 96
 _FIELD_PAD = 0.10
 _SHORTEST_STEP = 5e-4
+_NOWHERE = 1e3  # m: no arm reaches so far
 _AT_ONCE = 32  # configurations of a leg
 
 
@@ -190,21 +191,6 @@ def _place(body, q, links, placed):  # type: ignore[no-untyped-def]
                     placed[c, 3 * end + a] = m[a, 0] * x + m[a, 1] * y + m[a, 2] * z + m[a, 3]
 
 
-@entry()
-def overlapping(body, joints):  # type: ignore[no-untyped-def]
-    """Return in how many of joints (n, r) each of the body's pairs (s,) overlaps."""
-    links, placed = np.empty((joints.shape[1], 3, 4)), np.empty((body.capsules.shape[0], 6))
-    hits = np.zeros(body.pairs.shape[0], dtype=np.int64)
-    for i in range(joints.shape[0]):
-        _place(body, joints[i], links, placed)
-        for s in range(body.pairs.shape[0]):
-            first, second = body.pairs[s, 0], body.pairs[s, 1]
-            radius = body.capsules[first, 6] + body.capsules[second, 6]
-            if _segment_segment(placed[first], placed[second]) < radius * radius:
-                hits[s] += 1
-    return hits
-
-
 @part()
 def configuration_state(body, q, links, placed):  # type: ignore[no-untyped-def]
     """Return FREE, SELF, PART, OBSTACLE or SIGHT for joints q (r,).
@@ -253,6 +239,16 @@ def states(body, joints):  # type: ignore[no-untyped-def]
     for i in range(n):
         out[i] = configuration_state(body, joints[i], links, placed)
     return out
+
+
+def overlapping(body: Body, joints: Floats) -> Ints:
+    """Return in how many of joints (n, r) each of the body's pairs (s,) overlaps."""
+    alone = body._replace(
+        boxes=body.boxes[:0], mounting=body.mounting[:0], sight=body.sight[:0],
+        field=np.full((2, 2, 2), np.inf), field_origin=np.full(3, -_NOWHERE), field_step=2.0 * _NOWHERE,
+    )  # fmt: skip
+    pairs = (body.pairs[s : s + 1] for s in range(len(body.pairs)))
+    return np.array([(states(alone._replace(pairs=pair), joints) == SELF).sum() for pair in pairs], dtype=np.int64)
 
 
 def leg_state(body: Body, start: Floats, end: Floats, step: float) -> int:

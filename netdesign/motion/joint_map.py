@@ -25,7 +25,7 @@ from netdesign.model.scene import Part
 from netdesign.model.stations import ViewingSphere
 from netdesign.model.task import RobotCell
 from netdesign.motion.cell import ArmCell, load_arm
-from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION, REASONS, configuration_state
+from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION, REASONS, states
 from netdesign.motion.joint_lookup import MapArrays, map_arrays, options_of
 from netdesign.motion.joint_sheets import sheets
 from netdesign.motion.kinematics import into_limits
@@ -203,8 +203,11 @@ def _fill(arm: ArmCell, targets: Floats, follows: bool) -> Arrays:
         solved, found = solved.reshape(*shape, BRANCHES, 6), found.reshape(*shape, BRANCHES)
     count, r = found.shape[-1], solved.shape[-1]
     rest = _rest(arm) if follows else math.nan
-    state = _states_of(arm.body, arm.placed.lower, arm.placed.upper, solved.reshape(-1, r), found.reshape(-1), rest)
-    joints, state = solved.astype(np.float32), state.reshape(*shape, count)
+    flat = solved.reshape(-1, r)
+    state = _limited(arm.placed.lower, arm.placed.upper, flat, found.reshape(-1), rest)
+    within = state == FREE
+    state[within] = states(arm.body, flat[within])
+    joints, state = flat.reshape(solved.shape).astype(np.float32), state.reshape(*shape, count)
     return {"joints": joints, "state": state, "good": _good(joints, state, np.array(arm.placed.wraps))}
 
 
@@ -241,21 +244,18 @@ def _closed(axes, points, wrist, flange_inverse, targets, solved, found):  # typ
 
 
 @entry()
-def _states_of(body, lower, upper, joints, found, rest):  # type: ignore[no-untyped-def]
-    """Bring joints (N, r) into their limits in place and return their states (N,) int8.
+def _limited(lower, upper, joints, found, rest):  # type: ignore[no-untyped-def]
+    """Bring joints (N, r) into their limits in place; return NO_SOLUTION, LIMITS or FREE (N,) int8.
 
     ``rest``: value of the last joint everywhere, NaN to leave it.
     """
     count, r = joints.shape
-    links, placed = np.empty((r, 3, 4)), np.empty((body.capsules.shape[0], 6))
-    state = np.full(count, NO_SOLUTION, dtype=np.int8)
+    state = np.empty(count, dtype=np.int8)
     for i in range(count):
+        state[i] = NO_SOLUTION
         if not found[i]:
             continue
         if not math.isnan(rest):
             joints[i, r - 1] = rest
-        if into_limits(joints[i], lower, upper):
-            state[i] = configuration_state(body, joints[i], links, placed)
-        else:
-            state[i] = LIMITS
+        state[i] = FREE if into_limits(joints[i], lower, upper) else LIMITS
     return state

@@ -5,6 +5,7 @@ rays are nearly parallel, and the part of the tour beyond the longest admissible
 follows the first failing stage. What is reported is computed anew, exactly, in ``finish``.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -111,8 +112,8 @@ def missing_sightings(cells: Ints, tables: SphereTables, at_least: NDArray[np.ui
 @part()
 def write_direction(alpha: float, beta: float, direction: Floats) -> None:
     """Write the unit vector (3,) of a viewpoint."""
-    flat = np.cos(beta)
-    direction[0], direction[1], direction[2] = flat * np.cos(alpha), flat * np.sin(alpha), np.sin(beta)
+    flat = math.cos(beta)
+    direction[0], direction[1], direction[2] = flat * math.cos(alpha), flat * math.sin(alpha), math.sin(beta)
 
 
 @part()
@@ -163,7 +164,7 @@ def precision_objective(variances: Floats, tables: SphereTables) -> float:
         largest = 0.0
         for value in variances:
             largest = max(largest, value)
-        return float(np.sqrt(largest * tables.variance))
+        return float(math.sqrt(largest * tables.variance))
     total = 0.0
     for value in variances:
         total += value

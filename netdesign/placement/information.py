@@ -17,6 +17,8 @@ so a cell whose viewpoints lie within delta of its middle admits at most value +
 delta² / 2, gradients added over the points before the norm is taken. gain and sigma enter by their best in the cell.
 """
 
+import math
+
 import numpy as np
 
 from netdesign.model.arrays import Bools, Floats, Ints
@@ -38,10 +40,10 @@ def weight(
         sigmas: (y, x) focal² / sigma², at most, over depth and cosine; last row: lowest depth, step of the depth.
     """
     best = 1.0
-    nearest = z - 2.0 * w * np.sin(0.5 * delta)
+    nearest = z - 2.0 * w * math.sin(0.5 * delta)
     if len(gains) > 2:
         r = lateral / z
-        shift = 2.0 * w * np.sin(0.5 * delta) * np.sqrt(1.0 + r * r) / max(nearest, 1e-9)
+        shift = 2.0 * w * math.sin(0.5 * delta) * math.sqrt(1.0 + r * r) / max(nearest, 1e-9)
         bins = len(gains) - 1
         first = min(max(int((r - shift) / gains[bins]), 0), bins - 1)
         last = min(max(int((r + shift) / gains[bins]), 0), bins - 1)
@@ -51,11 +53,11 @@ def weight(
     rows, columns = sigmas.shape[0] - 1, sigmas.shape[1]
     if rows == 1:
         return float(best * sigmas[0, 0])
-    sine = min(2.0 * radius * np.sin(0.5 * delta) / distance, 1.0)
+    sine = min(2.0 * radius * math.sin(0.5 * delta) / distance, 1.0)
     # cos(i - spread), at most 1
     steepest = 1.0
-    if cosine < np.sqrt(1.0 - sine * sine):
-        steepest = cosine * np.sqrt(1.0 - sine * sine) + np.sqrt(max(1.0 - cosine * cosine, 0.0)) * sine
+    if cosine < math.sqrt(1.0 - sine * sine):
+        steepest = cosine * math.sqrt(1.0 - sine * sine) + math.sqrt(max(1.0 - cosine * cosine, 0.0)) * sine
     row = min(max(int((nearest - sigmas[rows, 0]) / sigmas[rows, 1]), 0), rows - 1)
     column = min(max(int(steepest * columns), 0), columns - 1)
     return float(best * sigmas[row, column])
@@ -111,7 +113,7 @@ def largest_gains(
         for piece in range(parts * parts):
             alpha = grid[0] + (cell % columns + (piece % parts + 0.5) / parts) / grid[1]
             beta = grid[3] + (cell // columns + (piece // parts + 0.5) / parts) / grid[4]
-            ux, uy, uz = np.cos(beta) * np.cos(alpha), np.cos(beta) * np.sin(alpha), np.sin(beta)
+            ux, uy, uz = math.cos(beta) * math.cos(alpha), math.cos(beta) * math.sin(alpha), math.sin(beta)
             delta = spreads[cell // columns, piece // parts]
             value = curvature = gx = gy = gz = 0.0
             for tag in range(len(points) // 4):
@@ -129,12 +131,12 @@ def largest_gains(
                     scale = sigmas[0, 0]
                     if len(gains) > 2 or len(sigmas) > 2:
                         square = px * px + py * py + pz * pz
-                        distance = np.sqrt(square + radius * radius - 2.0 * radius * up)
+                        distance = math.sqrt(square + radius * radius - 2.0 * radius * up)
                         facing = radius * (ux * normals[j, 0] + uy * normals[j, 1] + uz * normals[j, 2])
                         facing -= px * normals[j, 0] + py * normals[j, 1] + pz * normals[j, 2]
-                        lateral = np.sqrt(max(square - up * up, 0.0))
+                        lateral = math.sqrt(max(square - up * up, 0.0))
                         scale = weight(
-                            z, lateral, np.sqrt(square), facing / distance, distance, radius, delta, gains, sigmas
+                            z, lateral, math.sqrt(square), facing / distance, distance, radius, delta, gains, sigmas
                         )
                     inverse = 1.0 / z
                     scale *= inverse * inverse * inverse * inverse
@@ -145,7 +147,7 @@ def largest_gains(
                     gz += scale * (forms[j, 3] + 2.0 * cz + steep * pz)
                     curvature += scale * z**4 * forms[j, 10]
             radial = gx * ux + gy * uy + gz * uz
-            slope = np.sqrt(max(gx * gx + gy * gy + gz * gz - radial * radial, 0.0))
+            slope = math.sqrt(max(gx * gx + gy * gy + gz * gz - radial * radial, 0.0))
             result[index] = max(result[index], value + slope * delta + 0.5 * curvature * delta * delta)
     return result
 

@@ -8,6 +8,7 @@ only when that brings the move within reach. Every network tried is written out,
 With motion in joints the workspace tour only guides the moves; f2 of what was tried is then computed in joints.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -52,16 +53,16 @@ class Tries(NamedTuple):
 @part()
 def write_step(viewpoint: Floats, direction: Floats, step: Floats, limits: Floats, moved: Floats) -> None:
     """Write the viewpoint (2,) after a step (bearing, length) along the sphere, folded into ``limits`` (4,)."""
-    east_x, east_y = -np.sin(viewpoint[0]), np.cos(viewpoint[0])
-    sine, up = np.sin(step[1]), np.cos(step[1])
-    east, north = np.cos(step[0]) * sine, np.sin(step[0]) * sine
+    east_x, east_y = -math.sin(viewpoint[0]), math.cos(viewpoint[0])
+    sine, up = math.sin(step[1]), math.cos(step[1])
+    east, north = math.cos(step[0]) * sine, math.sin(step[0]) * sine
     x = up * direction[0] + east * east_x - north * direction[2] * east_y
     y = up * direction[1] + east * east_y + north * direction[2] * east_x
     z = up * direction[2] + north * (direction[0] * east_y - direction[1] * east_x)
     middle = 0.5 * (limits[0] + limits[1])
-    alpha = middle + (np.arctan2(y, x) - middle + np.pi) % (2.0 * np.pi) - np.pi
+    alpha = middle + (math.atan2(y, x) - middle + np.pi) % (2.0 * np.pi) - np.pi
     moved[0] = min(max(alpha, limits[0]), limits[1])
-    moved[1] = min(max(np.arctan2(z, np.sqrt(x * x + y * y)), limits[2]), limits[3])
+    moved[1] = min(max(math.atan2(z, math.sqrt(x * x + y * y)), limits[2]), limits[3])
 
 
 @part()
@@ -71,7 +72,7 @@ def write_chords(directions: Floats, k: int, a: int, D: Floats) -> None:
         square = 0.0
         for axis in range(3):
             square += (directions[a, axis] - directions[b, axis]) ** 2
-        D[a + 1, b + 1] = D[b + 1, a + 1] = np.sqrt(square)
+        D[a + 1, b + 1] = D[b + 1, a + 1] = math.sqrt(square)
 
 
 @part()
@@ -137,7 +138,7 @@ def improve_networks(
             t[x] = x
         f2 = tables.radius * _improve(D, t[: k + 1], P)
         w = tries.preference[b]
-        value = w * np.log(f1) + (1.0 - w) * np.log(f2 + 1e-9)
+        value = w * math.log(f1) + (1.0 - w) * math.log(f2 + 1e-9)
         for c in range(tries.kind.shape[1]):
             kind = tries.kind[b, c]
             i = k if kind == ADD else tables.fixed + tries.camera[b, c] % max(k - tables.fixed, 1)
@@ -153,7 +154,7 @@ def improve_networks(
                 there[i, 0], there[i, 1], new_cells[i] = here[k - 1, 0], here[k - 1, 1], cells[k - 1]
                 then[i, 0], then[i, 1], then[i, 2] = now[k - 1, 0], now[k - 1, 1], now[k - 1, 2]
             else:
-                if np.isnan(tries.viewpoint[b, c, 0]):
+                if math.isnan(tries.viewpoint[b, c, 0]):
                     write_step(here[i % k], now[i % k], tries.step[b, c], tables.limits, there[i])
                 else:
                     there[i, 0], there[i, 1] = tries.viewpoint[b, c, 0], tries.viewpoint[b, c, 1]
@@ -186,7 +187,7 @@ def improve_networks(
                 gone = i + 1 if kind == MOVE else -1
                 length = reinserted(D, t, k + 1, gone, i + 1, trial_D[i + 1], trial)
             new_f2 = tables.radius * length
-            near = w * np.log(new_f1) + (1.0 - w) * np.log(new_f2 + 1e-9) < value + PROMISING
+            near = w * math.log(new_f1) + (1.0 - w) * math.log(new_f2 + 1e-9) < value + PROMISING
             if kind == MOVE and near:
                 for x in range(1, k + 1):
                     for y in range(1, k + 1):
@@ -195,7 +196,7 @@ def improve_networks(
                 new_f2 = tables.radius * _improve(trial_D, trial[: k + 1], P)
             objectives[b, c, 0], objectives[b, c, 1] = new_f1, new_f2
             violation[b, c] = excess(new_f2, tables.longest)
-            new_value = w * np.log(new_f1) + (1.0 - w) * np.log(new_f2 + 1e-9)
+            new_value = w * math.log(new_f1) + (1.0 - w) * math.log(new_f2 + 1e-9)
             if kind != MOVE or violation[b, c] > 0 or new_value >= value:
                 continue
             value = new_value

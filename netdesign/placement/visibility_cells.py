@@ -14,6 +14,8 @@ from the sphere's centre and R the radius:
   the derivatives of its two ends, subtracted before they are bounded.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,24 +43,24 @@ def classify(
         points: (5, 3) of the tag.  away: (5,) their distances from the sphere's centre.  normal: (3,).
         settings: of ``visibility.sight_settings``.  field: of ``visibility_map.field_bounds``.
     """
-    moved = 2.0 * radius * np.sin(0.5 * delta)
-    sin_limit = np.sqrt(max(1.0 - settings[12] ** 2, 0.0))
+    moved = 2.0 * radius * math.sin(0.5 * delta)
+    sin_limit = math.sqrt(max(1.0 - settings[12] ** 2, 0.0))
     everywhere = True
     nearest, widest, farthest_out = np.inf, 0.0, 0.0
     image = np.empty((4, 2))
     for k in range(4):
         dx, dy, dz = points[k, 0] - pose[0, 3], points[k, 1] - pose[1, 3], points[k, 2] - pose[2, 3]
         z = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
-        depth_change = 2.0 * away[k] * np.sin(0.5 * delta)
+        depth_change = 2.0 * away[k] * math.sin(0.5 * delta)
         if z + depth_change <= 0.0 or z + depth_change < settings[14] or z - depth_change > settings[15]:
             return HIDDEN
         if z - depth_change < settings[14] or z + depth_change > settings[15]:
             everywhere = False
-        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        distance = math.sqrt(dx * dx + dy * dy + dz * dz)
         sine = moved / distance
         if sine >= 1.0 or z - depth_change <= 0.0:
             return UNDECIDED
-        cosine = np.sqrt(1.0 - sine * sine)
+        cosine = math.sqrt(1.0 - sine * sine)
         seen_at = -(dx * normal[0] + dy * normal[1] + dz * normal[2]) / distance
         if seen_at < settings[12] * cosine - sin_limit * sine - 1e-12:
             return HIDDEN
@@ -70,15 +72,15 @@ def classify(
         widest = max(widest, image[k, 0] ** 2 + image[k, 1] ** 2)
         farthest_out = max(farthest_out, away[k])
     # The worst of the four corners stands for all of them.
-    stretch = np.sqrt(1.0 + widest)
-    shift = 2.0 * farthest_out * np.sin(0.5 * min(turn, np.pi)) * stretch / nearest
+    stretch = math.sqrt(1.0 + widest)
+    shift = 2.0 * farthest_out * math.sin(0.5 * min(turn, np.pi)) * stretch / nearest
     reach = field[1] + shift
     square = reach * reach
     tangential = abs(settings[6]) + abs(settings[7])
     bend = 3.0 * abs(settings[4]) * square + 5.0 * abs(settings[5]) * square * square + 6.4 * tangential * reach
     curve = 6.0 * abs(settings[4]) * reach + 20.0 * abs(settings[5]) * reach * square + 6.4 * tangential
     focal_high, focal_low = max(settings[0], settings[1]), min(settings[0], settings[1])
-    stretch = np.sqrt(1.0 + (np.sqrt(widest) + shift) ** 2)
+    stretch = math.sqrt(1.0 + (math.sqrt(widest) + shift) ** 2)
     edge = stretch * tag_size / nearest
     edge_change = turn * edge * (1.0 + 2.0 * farthest_out / nearest)
     shortest_low, shortest_high = np.inf, np.inf
@@ -88,14 +90,14 @@ def classify(
     for k in range(4):
         x, y = image[k, 0], image[k, 1]
         s = x * x + y * y
-        r = np.sqrt(s)
+        r = math.sqrt(s)
         if r - shift > field[1]:
             return HIDDEN
         if free_roll:
             if r + shift > field[0]:
                 everywhere = False
             x0, y0 = image[k - 1, 0], image[k - 1, 1]
-            length = np.sqrt((x - x0) ** 2 + (y - y0) ** 2)
+            length = math.sqrt((x - x0) ** 2 + (y - y0) ** 2)
             shortest_low = min(shortest_low, focal_low * max(1.0 - bend, 0.0) * (length - edge_change))
             shortest_high = min(shortest_high, focal_high * (1.0 + bend) * (length + edge_change))
             continue
@@ -114,10 +116,10 @@ def classify(
         if k == 0:
             first_u, first_v = u, v
         else:
-            length = np.sqrt((u - last_u) ** 2 + (v - last_v) ** 2)
+            length = math.sqrt((u - last_u) ** 2 + (v - last_v) ** 2)
             shortest_low, shortest_high = min(shortest_low, length - change), min(shortest_high, length + change)
         if k == 3:
-            length = np.sqrt((u - first_u) ** 2 + (v - first_v) ** 2)
+            length = math.sqrt((u - first_u) ** 2 + (v - first_v) ** 2)
             shortest_low, shortest_high = min(shortest_low, length - change), min(shortest_high, length + change)
         last_u, last_v = u, v
     if shortest_high < settings[13] - 1e-9:
@@ -137,7 +139,7 @@ def shadow(
     for trial in range(2):
         for k in range(4, -1, -1):
             dx, dy, dz = pose[0, 3] - points[k, 0], pose[1, 3] - points[k, 1], pose[2, 3] - points[k, 2]
-            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            distance = math.sqrt(dx * dx + dy * dy + dz * dz)
             height = dx * normal[0] + dy * normal[1] + dz * normal[2]
             if height <= settings[16] or distance <= spread:
                 return UNDECIDED
@@ -192,7 +194,7 @@ def fill(
                 poses[block], radius, delta, turn, points[g], away[g], normals[g], settings, field, tag_size
             )
             if mesh is not None and shadowed[g] and (state == VISIBLE or (state == UNDECIDED and size == 1)):
-                spread = 2.0 * radius * np.sin(0.5 * delta)
+                spread = 2.0 * radius * math.sin(0.5 * delta)
                 state = shadow(state, poses[block], spread, points[g], normals[g], settings, mesh)
             waiting[block, g] = state == UNDECIDED and size > 1
             if state == HIDDEN or waiting[block, g]:

@@ -49,6 +49,24 @@ def test_the_cheapest_network_that_meets_the_largest_sigma_is_the_answer():
         assert (objectives <= row).all(axis=1).sum() == 1
 
 
+@pytest.mark.parametrize(("limit", "stages"), [(60.0, {"requirements"}), (1.0, {"requirements", "more images"})])
+def test_the_way_to_an_answer_is_reported(limit, stages):
+    """Every stage says how far it is and comes to its end, whether an answer is found or not."""
+    problem = Problem.build(task_of(plate_scene(side=3), max_images=4, requirements={"max_sigma_um": limit}))
+    calls = []
+
+    def progress(stage, done, total, note=""):
+        calls.append((stage, done, total))
+
+    finish(problem, run(problem, "memetic", 20, 10, 1), progress)
+    assert stages == {stage for stage, _, _ in calls} & {"requirements", "more images"}
+    for stage in stages:
+        own = [(done, total) for name, done, total in calls if name == stage]
+        assert own[0][0] == 0
+        assert own[-1][0] == own[-1][1]
+        assert all(done <= total for done, total in own)
+
+
 def test_a_distance_decides_through_the_full_covariance():
     asked = {"from": "0.0", "to": "8.2", "u95_um": 45.0}
     problem, design = designed(distances=[asked])

@@ -62,7 +62,7 @@ def finish(problem: NetworkProblem, state: State, progress: Progress = silent) -
         else:
             networks.append(found)
     progress("exact networks", len(rows), len(rows))
-    answer = cheapest_admissible(problem, members, exact.network)
+    answer = cheapest_admissible(problem, members, exact.network, progress)
     best = None if answer is None else answer.network
     if best is not None:  # what dominates it without keeping the requirements is no answer
         networks = [network for network in networks if not _dominates(network, best)] + [best]

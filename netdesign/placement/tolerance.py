@@ -2,36 +2,25 @@
 
 The search knows f1, not the largest sigma of a point nor the uncertainty of a distance. Here networks of its archive
 are carried on by a climb over single cameras: first until the requirements are met with as few images as possible, then
-towards a shorter tour. The climb works on proved sightings, scaled by what the exact network showed (``Load.scale``:
-exact over estimated, for every requirement); only exact values count in the end.
+towards a shorter tour. Only exact values count in the end.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.arrays import Floats
+from netdesign.model.progress import Progress
 from netdesign.model.results import DesignedNetwork
-from netdesign.photogrammetry.limited_error import direct_covariance
-from netdesign.photogrammetry.total_trace import propagated
+from netdesign.placement.climb import ROUNDS, SAFE, Load, climb, shorten, tour_of
 from netdesign.placement.decide import round_up
-from netdesign.placement.distances import (
-    COVERAGE_FACTOR,
-    SIGMA,
-    distance_functions,
-    distance_name,
-    distance_u95,
-    named_ends,
-)
-from netdesign.placement.network_problem import NetworkProblem, sighting_array
+from netdesign.placement.network_problem import NetworkProblem
 from netdesign.search.population import Population
 
-ROUNDS, MOVES = 80, 16  # of a climb, and networks tried in each
 NEAR = 2.5  # times the requirement: a size whose best network is farther away is not worth a climb
 MOST_IMAGES = 60  # that are tried to say how many would be enough
 TRIALS = 3  # exact checks of one size, each with the scale that the last one showed
-SAFE = 0.9995  # of the requirement, where a climb stops
 
 Exactly = Callable[[Floats], DesignedNetwork | str]
 
@@ -44,83 +33,14 @@ class Answer:
     reason: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class Load:
-    """The requirements on precision, and how far networks use them up: 1 is the limit.
-
-    Attributes:
-        names: (r,) in words.  limits: (r,) m.  ends: (d, 2) object points of the distances, the last d requirements.
-        functions: (3m, 7 + d) datum and distances as ``total_trace.propagated`` takes them.
-        scale: (r,) exact value over the estimate of the climb.
-    """
-
-    problem: NetworkProblem
-    names: tuple[str, ...]
-    limits: Floats
-    ends: Ints
-    functions: Floats
-    scale: Floats = field(default_factory=lambda: np.ones(0))
-
-    @staticmethod
-    def of(problem: NetworkProblem) -> "Load | None":
-        """Return the study's requirements on precision, None when there are none."""
-        asked = problem.task.study.requirements
-        names, limits = [], []
-        if asked.max_sigma_um is not None:
-            names, limits = [SIGMA], [1e-6 * asked.max_sigma_um]
-        ends = named_ends(problem.task)
-        names += [distance_name(item.from_, item.to) for item in asked.distances]
-        limits += [1e-6 * item.u95_um for item in asked.distances]
-        if not names:
-            return None
-        return Load(
-            problem=problem, names=tuple(names), limits=np.array(limits), ends=ends,
-            functions=distance_functions(problem.task.scene.targets.points, ends), scale=np.ones(len(names)),
-        )  # fmt: skip
-
-    def estimated(self, viewpoints: Floats) -> Floats:
-        """Return (r,) values in m of a network (k, 2) with sure sightings, not scaled; inf when not determined."""
-        task, poses = self.problem.task, self.problem.poses(viewpoints)
-        points, intrinsics = task.scene.targets.points, task.camera.intrinsics
-        visible, sigma = self.problem.visible(viewpoints), sighting_array(task, poses)
-        values = np.zeros(0)
-        if len(self.ends):
-            variances = propagated(poses, points, intrinsics, visible, sigma, self.functions)[1:]
-            values = COVERAGE_FACTOR * np.sqrt(variances)
-        if len(self.names) > len(self.ends):
-            covariance = direct_covariance(poses, points, intrinsics, visible, sigma)
-            values = np.append(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).max()), values)
-        return values
-
-    def exact(self, network: DesignedNetwork) -> Floats:
-        """Return (r,) values in m of a finished network."""
-        u95 = distance_u95(self.problem.task, network.world_from_cam, self.ends) if len(self.ends) else np.zeros(0)
-        return u95 if len(self.names) == len(self.ends) else np.append(network.precision.sigma.max(), u95)
-
-    def shares(self, viewpoints: Floats) -> Floats:
-        """Return (r,) how much of each requirement a network (k, 2) uses up, estimated and scaled."""
-        return np.asarray(self.scale * self.estimated(viewpoints) / self.limits)
-
-    def used(self, viewpoints: Floats) -> float:
-        """Return the largest share of a requirement that a network (k, 2) uses up."""
-        return float(self.shares(viewpoints).max())
-
-    def alone(self, row: int) -> Callable[[Floats], float]:
-        """Return the share of one requirement as a function of the network, above 10 where another one is not kept."""
-
-        def used(viewpoints: Floats) -> float:
-            shares = self.shares(viewpoints)
-            others = float(np.delete(shares, row).max(initial=0.0))
-            return float(shares[row]) if others <= 1.0 else 10.0 + others
-
-        return used
-
-
-def cheapest_admissible(problem: NetworkProblem, members: Population, exactly: Exactly) -> Answer | None:
+def cheapest_admissible(
+    problem: NetworkProblem, members: Population, exactly: Exactly, progress: Progress
+) -> Answer | None:
     """Return the network with fewest images, then the shortest tour, that keeps [requirements]; None without any.
 
     Args:
         members: of the archive, feasible.  exactly: as ``finish.Exact.network``.
+        progress: sizes looked at, then images added.
     """
     load = Load.of(problem)
     if load is None:
@@ -128,7 +48,9 @@ def cheapest_admissible(problem: NetworkProblem, members: Population, exactly: E
     sizes = members.objectives[:, 2].astype(int)
     nearest: tuple[float, Floats] | None = None
     climbed: list[Floats] = []
-    for size in np.unique(sizes).tolist():
+    different = np.unique(sizes).tolist()
+    for number, size in enumerate(different):
+        progress("requirements", number, len(different), f"{size} images")
         layer = members.take(sizes == size)
         rows = np.unique(np.round(np.linspace(0, len(layer) - 1, min(len(layer), 40))).astype(int))
         starts = [layer.genes[row][layer.bits[row]] for row in rows.tolist()]
@@ -148,66 +70,25 @@ def cheapest_admissible(problem: NetworkProblem, members: Population, exactly: E
             if share > 1.0:
                 break
             meeting = [start for start, value in zip(starts, shares, strict=True) if value <= SAFE] or [viewpoints]
-            shortened = shorten(problem, load, min(meeting, key=lambda start: _tour(problem, start)))
+            shortened = shorten(problem, load, min(meeting, key=lambda start: tour_of(problem, start)))
             found = exactly(shortened)
             if isinstance(found, str):
                 break
             values = load.exact(found)
             if (values <= load.limits).all():
+                progress("requirements", len(different), len(different))
                 return Answer(network=found, reason=_met(load, values))
             load = replace(load, scale=np.maximum(load.scale, values / load.estimated(shortened)) * (1 + 1e-6))
             shares = np.array([load.used(start) for start in starts])
             best = int(shares.argmin())
+    progress("requirements", len(different), len(different))
     assert nearest is not None
     for start in climbed[-2:-6:-2]:  # a smaller network enlarged may end where the climb of a large one does not
-        enlarged = _enlarged(problem, load, start, int(sizes.max()), exactly)
+        enlarged = _enlarged(problem, load, start, int(sizes.max()), exactly, progress)
+        progress("more images", 1, 1)
         if enlarged is not None and enlarged[1] is not None:
             return Answer(network=enlarged[1], reason=_met(load, load.exact(enlarged[1])))
-    return Answer(network=None, reason=_unmet(problem, load, nearest[1], exactly))
-
-
-def climb(problem: NetworkProblem, used: Callable[[Floats], float], viewpoints: Floats, rounds: int = ROUNDS) -> Floats:
-    """Move single cameras of a network (k, 2) while the share ``used`` falls; stop once it is met."""
-    share = used(viewpoints)
-    rng = np.random.default_rng([problem.task.study.seed, len(viewpoints), 1])
-    for _ in range(rounds):
-        if share <= SAFE or not len(viewpoints):  # met, or existing stations only
-            break
-        trials, _, violation = _neighbours(problem, rng, viewpoints)
-        for row in np.flatnonzero(violation <= 0).tolist():
-            value = used(trials[row])
-            if value < share:
-                share, viewpoints = value, trials[row]
-    return viewpoints
-
-
-def shorten(problem: NetworkProblem, load: Load, viewpoints: Floats) -> Floats:
-    """Move single cameras of an admissible network (k, 2) while the tour becomes shorter and everything stays met."""
-    tour = _tour(problem, viewpoints)
-    rng = np.random.default_rng([problem.task.study.seed, len(viewpoints), 2])
-    for _ in range(ROUNDS if len(viewpoints) else 0):
-        trials, length, violation = _neighbours(problem, rng, viewpoints)
-        for row in np.argsort(length, kind="stable").tolist():
-            if violation[row] <= 0 and length[row] < tour and load.used(trials[row]) <= SAFE:
-                viewpoints, tour = trials[row], float(length[row])
-                break
-    return viewpoints
-
-
-def _neighbours(problem: NetworkProblem, rng: np.random.Generator, viewpoints: Floats) -> tuple[Floats, Floats, Floats]:
-    """(MOVES, k, 2) networks with one camera moved, their f2 and violation."""
-    trials = np.tile(viewpoints, (MOVES, 1, 1))
-    rows, moved = np.arange(MOVES), rng.integers(0, len(viewpoints), MOVES)
-    stepped = problem.chromosomes.nudged(rng, trials[rows, moved])
-    anywhere = problem.chromosomes.uniform(rng, (MOVES,))
-    trials[rows, moved] = np.where((rng.random(MOVES) < 0.15)[:, None], anywhere, stepped)
-    objectives, violation = problem.evaluate(np.ones(trials.shape[:2], np.bool_), trials)
-    return trials, objectives[:, 1], violation
-
-
-def _tour(problem: NetworkProblem, viewpoints: Floats) -> float:
-    everything: Bools = np.ones((1, len(viewpoints)), np.bool_)
-    return float(problem.evaluate(everything, viewpoints[None])[0][0, 1])
+    return Answer(network=None, reason=_unmet(problem, load, nearest[1], exactly, progress))
 
 
 def _met(load: Load, values: Floats) -> str:
@@ -217,7 +98,7 @@ def _met(load: Load, values: Floats) -> str:
     )
 
 
-def _unmet(problem: NetworkProblem, load: Load, viewpoints: Floats, exactly: Exactly) -> str:
+def _unmet(problem: NetworkProblem, load: Load, viewpoints: Floats, exactly: Exactly, progress: Progress) -> str:
     """Return which requirement binds, the best that can be had, and what would satisfy it."""
     found = exactly(viewpoints)
     values = load.scale * load.estimated(viewpoints) if isinstance(found, str) else load.exact(found)
@@ -242,7 +123,8 @@ def _unmet(problem: NetworkProblem, load: Load, viewpoints: Floats, exactly: Exa
         if easier.used(longer) <= 1.0:
             ways.append(f"a tour of {_length(free, longer)} would reach it")
     checked = exactly if free is problem else None  # the exact check keeps the tour's limit
-    enough = None if ways else _enlarged(free, easier, viewpoints, MOST_IMAGES, checked)
+    enough = None if ways else _enlarged(free, easier, viewpoints, MOST_IMAGES, checked, progress)
+    progress("more images", 1, 1)
     if enough is not None:
         ways.append(f"{fixed + len(enough[0])} images would reach it, on a tour of {_length(free, enough[0])}")
     elif not ways:
@@ -263,7 +145,12 @@ def _each_alone(problem: NetworkProblem, load: Load, viewpoints: Floats) -> dict
 
 
 def _enlarged(
-    problem: NetworkProblem, load: Load, viewpoints: Floats, most: int, exactly: Exactly | None
+    problem: NetworkProblem,
+    load: Load,
+    viewpoints: Floats,
+    most: int,
+    exactly: Exactly | None,
+    progress: Progress,
 ) -> tuple[Floats, DesignedNetwork | None] | None:
     """The network with up to ``most`` images that meets the requirements; None when that is not enough.
 
@@ -273,7 +160,9 @@ def _enlarged(
     stations = stations[:: max(1, len(stations) // 60)]
     fixed = len(problem.task.existing)
     likely = min(most, 0.9 * (fixed + len(viewpoints)) * load.used(viewpoints) ** 2)
+    first = fixed + len(viewpoints)
     while fixed + len(viewpoints) < most:
+        progress("more images", fixed + len(viewpoints) - first, most - first, f"{fixed + len(viewpoints)} images")
         trials = np.concatenate([np.tile(viewpoints, (len(stations), 1, 1)), stations[:, None]], axis=1)
         f1, violation = problem.limited_scores(np.ones(trials.shape[:2], np.bool_), trials)
         near = fixed + len(viewpoints) + 1 >= likely
@@ -297,4 +186,4 @@ def _enlarged(
 
 def _length(problem: NetworkProblem, viewpoints: Floats) -> str:
     unit, scale = {"workspace": ("mm", 1e3), "joint": ("rad", 1.0), "time": ("s", 1.0)}[problem.task.study.motion]
-    return f"{round_up(scale * _tour(problem, viewpoints)):g} {unit}"
+    return f"{round_up(scale * tour_of(problem, viewpoints)):g} {unit}"

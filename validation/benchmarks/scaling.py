@@ -1,7 +1,7 @@
 """How evaluation and search grow with images n, object points m and population P: printed, and drawn in scaling.png.
 
 Networks of n images on the benchmark's box, every one feasible: a cover first, the rest at random. One of n, m, P
-changes at a time; the others stay at 30, 200 and 200.
+changes at a time; the others stay at 30, 216 and 200. The networks of a search have about half of the n images.
 """
 
 import time

@@ -10,7 +10,7 @@ from pymoo.util.nds.non_dominated_sorting import NonDominatedSorting
 from netdesign.errors import InputError
 from netdesign.search.archive import non_dominated, staircases
 from netdesign.search.engine import hypervolume, offspring, run
-from netdesign.search.operators import polynomial_mutation, sbx
+from netdesign.search.operators import polynomial_mutation, raised, root, sbx
 from netdesign.search.population import evaluated, joined
 from netdesign.search.selection import constrained_ranks, crowding, ranked, tournament
 from netdesign.search.state import load, save
@@ -133,6 +133,12 @@ def test_no_child_is_a_copy():
         rows = np.concatenate([together.bits, together.genes[..., 0]], axis=1)
         assert len(children) == 20
         assert len(rows) - len(np.unique(rows, axis=0)) == copies
+
+
+@given(st.floats(1e-6, 1e3), st.sampled_from([1.0, 2.0, 16.0, 21.0, 3.5, 0.5]))
+def test_powers_and_roots_by_squaring(value, exponent):
+    np.testing.assert_allclose(raised(np.array([value]), exponent), value**exponent, rtol=1e-13)
+    np.testing.assert_allclose(root(np.array([value]), exponent), value ** (1 / exponent), rtol=1e-13)
 
 
 class Dots:

@@ -129,9 +129,11 @@ def offspring(
 
 def _fingerprints(bits: Bools, genes: Floats) -> NDArray[np.uint64]:
     """A hash (P,) of 64 bits per chromosome: equal for equal ones, and by chance never for others."""
-    words = np.concatenate([np.ascontiguousarray(genes).reshape(len(genes), -1).view(np.uint64), bits], axis=1)
-    words ^= words >> np.uint64(32)  # the high bits of a float change seldom, the low ones of a product carry no others
-    return np.asarray((words * _factors(words.shape[1])).sum(axis=1, dtype=np.uint64))
+    words = np.ascontiguousarray(genes).reshape(len(genes), -1).view(np.uint64)
+    words = words ^ (words >> np.uint64(32))  # what differs in the high bits only would be multiplied out of the word
+    factors = _factors(words.shape[1] + bits.shape[1])
+    words *= factors[bits.shape[1] :]
+    return np.asarray(words.sum(axis=1) + np.where(bits, factors[: bits.shape[1]], np.uint64(0)).sum(axis=1))
 
 
 @lru_cache

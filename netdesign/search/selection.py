@@ -38,8 +38,10 @@ def crowding(objectives: Floats, ranks: Ints) -> Floats:
     """Return the crowding distance (P,) of every row within its front; inf at the ends of each objective."""
     count = len(objectives)
     distance = np.zeros(count)
+    short = ranks.astype(np.uint16) if count < 1 << 16 else ranks  # sorted by radix
     for values in objectives.T:
-        order = np.lexsort((values, ranks))
+        order = np.argsort(values, kind="stable")
+        order = order[np.argsort(short[order], kind="stable")]
         ordered, front = values[order], ranks[order]
         starts, ends = first_of_runs(front)
         extent = (ordered[np.flatnonzero(ends)] - ordered[np.flatnonzero(starts)])[np.cumsum(starts) - 1]

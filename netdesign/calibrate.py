@@ -30,7 +30,7 @@ from netdesign.photogrammetry.precision import corner_rms
 SIDES_PX = (20.0, 30.0, 50.0, 85.0, 140.0)
 INCIDENCES_DEG = (0.0, 35.0, 60.0)
 SMALLEST_CELL_PX = 1.5  # across the tilt axis: the pipeline's own limit (imaging.measure.Gates)
-REPLICATES = 8  # noise realisations of one picture
+REPLICATES = 16  # noise realisations of one picture
 ACROSS, DOWN = 4, 3  # tags of one picture, each turned at random
 FOCAL_PX = 6000.0  # long, so that size and incidence hardly vary over the picture
 TAG_SIZE_M = 0.02
@@ -44,8 +44,8 @@ class NoiseCell:
     Attributes:
         tags: measured tag pictures.  missed: not detected.  rejected: by the gates.
         bias_px: (2,) mean error in x and y.  shrink_px: mean error towards the tag's centre.
-        systematic_px: rms over tags of the error that stays from one noise realisation to the next.
-        noise_px: rms about it.  shape_px: the closed form with k = 1 and no floor.
+        systematic_px: rms error in the same picture without noise.
+        noise_px: rms about each tag's mean over the realisations.  shape_px: the closed form with k = 1, no floor.
         nees: mean of e' C⁻¹ e / 8 with the fit's covariance C and the floor; 1 when C is right.
     """
 
@@ -125,9 +125,8 @@ def calibrate_noise(
     if not usable:
         raise InputError("calibrate-noise: expected tags to be found on the grid, found none: too much blur or noise")
     k = float(np.exp(np.mean([np.log(cell.noise_px / cell.shape_px) for cell in usable])))
-    noise = np.array([k * cell.shape_px for cell in usable])
-    total = np.hypot([cell.noise_px for cell in usable], [cell.systematic_px for cell in usable])
-    floor = _floor(noise, total)
+    noise = np.array([cell.noise_px for cell in usable])
+    floor = _floor(noise, np.hypot(noise, [cell.systematic_px for cell in usable]))
     finished = [replace(cell, nees=_nees(errors, covariances, floor)) for cell, errors, covariances in results]
     measured = [np.hypot(cell.noise_px, cell.systematic_px) for cell in finished]
     predicted = [np.hypot(k * cell.shape_px, floor) for cell in finished]
@@ -140,9 +139,9 @@ def calibrate_noise(
 
 
 def _floor(noise: Floats, total: Floats) -> float:
-    """Return the floor (px) with which the predicted sigma is nearest, in ratio, to the total measured ones.
+    """Return the floor (px) with which noise and floor are nearest, in ratio, to the total sigma.
 
-    A mean of the systematic parts would be that of the small tags, where noise hides it, and spoil the large ones.
+    A mean of the systematic parts would be that of the small tags, where it does not matter, and spoil the large ones.
     """
     candidates = np.linspace(0.0, float(total.max()), 2001)
     ratio = np.log(np.hypot(noise, candidates[:, None]) / total)
@@ -180,6 +179,12 @@ def _measure_cell(job: tuple[Camera, Shoot, float, float, int, int]) -> tuple[No
     truth = project(pose, scene.targets.points, bench.intrinsics)[0].reshape(-1, CORNERS_PER_TAG, 2)
     row_of_tag = {tag: row for row, tag in enumerate(scene.targets.ids.tolist())}
     light = Photographer(scene, bench, shoot).light(pose)
+    clean = Photographer.expose(light, bench, replace(shoot, noise=False, bits=16), index)
+    systematic = [
+        tag.corners_px - truth[row_of_tag[tag.tag_id]]
+        for tag in measure(clean, bench, scene.targets.family, TAG_SIZE_M, row_of_tag)
+        if not tag.rejected
+    ]
     errors, covariances, of_tag, missed, rejected = [], [], [], 0, 0
     for replicate in range(replicates):
         picture = Photographer.expose(light, bench, shoot, 1000 * index + replicate)
@@ -194,7 +199,6 @@ def _measure_cell(job: tuple[Camera, Shoot, float, float, int, int]) -> tuple[No
             covariances.append(tag.covariance_px2)
             of_tag.append(row)
     e, c = np.reshape(errors, (-1, 8)), np.reshape(covariances, (-1, 8, 8))
-    systematic, noise = _split(e, np.array(of_tag, dtype=np.int64))
     outward = truth - truth.mean(axis=1, keepdims=True)
     outward /= np.linalg.norm(outward, axis=2, keepdims=True)
     inward = -np.einsum("kcx,kcx->kc", e.reshape(-1, 4, 2), outward[np.array(of_tag, dtype=np.int64)])
@@ -203,28 +207,20 @@ def _measure_cell(job: tuple[Camera, Shoot, float, float, int, int]) -> tuple[No
     cell = NoiseCell(
         side_px=side, incidence_deg=incidence_deg, tags=len(e), missed=missed, rejected=rejected,
         bias_px=(float(bias[0]), float(bias[1])), shrink_px=float(inward.mean()) if len(e) else float("nan"),
-        systematic_px=systematic, noise_px=noise, shape_px=float(shape), nees=float("nan"),
+        systematic_px=float(np.sqrt(np.mean(np.square(systematic)))) if systematic else float("nan"),
+        noise_px=_noise(e, np.array(of_tag, dtype=np.int64)), shape_px=float(shape), nees=float("nan"),
     )  # fmt: skip
     return cell, e, c
 
 
-def _split(errors: Floats, of_tag: Any) -> tuple[float, float]:
-    """Return the systematic and the noise part (rms, px) of errors (k, 8) of repeatedly measured tags (k,)."""
-    within, degrees, between = 0.0, 0, []
+def _noise(errors: Floats, of_tag: Any) -> float:
+    """Return the rms (px) of errors (k, 8) of repeatedly measured tags (k,) about each tag's mean."""
+    within, degrees = 0.0, 0
     for tag in np.unique(of_tag):
         group = errors[of_tag == tag]
-        if len(group) < 2:
-            continue
-        mean = group.mean(axis=0)
-        within += float(((group - mean) ** 2).sum())
+        within += float(((group - group.mean(axis=0)) ** 2).sum())
         degrees += 8 * (len(group) - 1)
-        between.append((float((mean**2).mean()), len(group)))
-    if not degrees:
-        return float("nan"), float("nan")
-    variance = within / degrees
-    # The mean of r realisations still carries a share 1/r of the noise.
-    systematic = float(np.mean(np.array([square - variance / count for square, count in between])))
-    return float(np.sqrt(max(systematic, 0.0))), float(np.sqrt(variance))
+    return float(np.sqrt(within / degrees)) if degrees else float("nan")
 
 
 def _nees(errors: Floats, covariances: Floats, floor_px: float) -> float:

@@ -54,7 +54,7 @@ def _edge(x, at, sigma):
     return sigma * (upto((x + 0.5 - at) / sigma) - upto((x - 0.5 - at) / sigma))
 
 
-@pytest.mark.parametrize(("cell", "sigma", "limit"), [(4.0, 0.7, 5e-4), (8.0, 0.4, 2e-3), (16.0, 0.7, 3e-3)])
+@pytest.mark.parametrize(("cell", "sigma", "limit"), [(4.0, 0.7, 5e-4), (8.0, 0.4, 2e-3), (16.0, 0.7, 1e-3)])
 def test_a_tag_square_to_the_pixel_grid_is_measured_wherever_it_lies_in_the_pixel(cell, sigma, limit):
     pattern = np.pad(cells("tag36h11", 7), 1, constant_values=1).astype(float)
     pixels, camera = np.arange(int(12 * cell) + 12), np.array([1000.0, 1000, 0, 0, 0, 0, 0, 0])
@@ -88,8 +88,8 @@ def test_coverage_of_sub_pixels_adds_up_to_the_cells_area():
     x, y = np.meshgrid((np.arange(200) + 0.5) / 2 - 0.5, (np.arange(200) + 0.5) / 2 - 0.5)
     layers = np.empty((2, 200, 200))
     cover(x, y, tag_from_px, pattern, 0.5, layers)
-    assert layers.min() > -1e-9
-    assert (layers.sum(axis=0) < 1 + 1e-9).all()
+    assert layers.min() > -1e-3  # the term for the shear is of first order
+    assert (layers.sum(axis=0) < 1 + 1e-3).all()
     dark = ((1 - layers.sum(axis=0)) / 4).sum()
     to_px = homography(corners)[0]
     expected = sum(_area(to_px, column, row) for row in range(8) for column in range(8) if pattern[row, column] == 0)

@@ -13,6 +13,7 @@ corners with dh/dcorner at the end.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from netdesign.imaging.lens import ideal_pixels, measured_pixels
@@ -27,8 +28,8 @@ START_SIGMA_PX = 0.9
 SURROUND_SIGMA = 0.3  # a priori, of the surround about white, in units of the contrast
 SLOPE_SIGMA = 0.3  # a priori, of the light's slope over half a tag
 CHOOSING = 4  # iterations that choose their pixels; later a pixel on the rim must not flicker in and out
-LARGE_TAG_PX = 110.0  # above it one sub-pixel per pixel is enough for any blur of SHARPEST_COARSE_PX or more
-SHARPEST_COARSE_PX = 0.65
+SUBPIXELS = 2  # along a pixel: one alone leaves 0.002 px of systematic error, a fifth of a large tag's variance
+NODES = 8  # per axis, of the lens's interpolation over a tag
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,16 +137,16 @@ def _normal_equations(
 class _Patch:
     """The pixels around one tag and their places in ideal pixels."""
 
-    def __init__(self, picture: NDArray[np.generic], corners: Floats, intrinsics: Floats, rim_px: float, per_pixel: int,
+    def __init__(self, picture: NDArray[np.generic], corners: Floats, intrinsics: Floats, rim_px: float,
                  sigma_limit: float) -> None:  # fmt: skip
         low = np.maximum(np.floor(corners.min(axis=0) - rim_px).astype(int), 0)
         high = np.minimum(np.ceil(corners.max(axis=0) + rim_px).astype(int) + 1, (picture.shape[1], picture.shape[0]))
         self.grey = np.asarray(picture[low[1] : high[1], low[0] : high[0]], np.float64)
-        self.per_pixel, self.sigma_limit = per_pixel, sigma_limit
-        self.reach = kernel_reach(sigma_limit, per_pixel)
+        self.sigma_limit = sigma_limit
+        self.reach = kernel_reach(sigma_limit, SUBPIXELS)
         size = high - low
         fine = [
-            low[axis] - 0.5 + (np.arange(size[axis] * per_pixel + 2 * self.reach) - self.reach + 0.5) / per_pixel
+            low[axis] - 0.5 + (np.arange(size[axis] * SUBPIXELS + 2 * self.reach) - self.reach + 0.5) / SUBPIXELS
             for axis in (0, 1)
         ]
         bent = bool(intrinsics[4:].any())
@@ -158,8 +159,28 @@ class _Patch:
 
 
 def _grid(x: Floats, y: Floats, intrinsics: Floats, bent: bool) -> Floats:
-    grid = np.stack(np.meshgrid(x, y), axis=-1)
-    return ideal_pixels(grid.reshape(-1, 2), intrinsics).reshape(grid.shape) if bent else grid
+    """Return the (len(y), len(x), 2) ideal pixels of a grid of measured ones.
+
+    The lens is smooth over a tag: the polynomials through NODES x NODES Chebyshev points stand for it.
+    """
+    if not bent:
+        return np.stack(np.meshgrid(x, y), axis=-1)
+    at_x, from_x = _interpolation(x)
+    at_y, from_y = _interpolation(y)
+    nodes = np.stack(np.meshgrid(at_x, at_y), axis=-1).reshape(-1, 2)
+    values = ideal_pixels(nodes, intrinsics).reshape(NODES, NODES, 2)
+    grid = np.empty((len(y), len(x), 2))
+    for axis in (0, 1):
+        grid[..., axis] = from_y @ values[..., axis] @ from_x.T
+    return grid
+
+
+def _interpolation(x: Floats) -> tuple[Floats, Floats]:
+    """Return NODES Chebyshev points over the range of x (k,) and the (k, NODES) matrix from values there to x."""
+    nodes = -np.cos((np.arange(NODES) + 0.5) * np.pi / NODES)
+    middle, half = 0.5 * (x[0] + x[-1]), 0.5 * (x[-1] - x[0])
+    at = chebyshev.chebvander((x - middle) / half, NODES - 1) @ np.linalg.inv(chebyshev.chebvander(nodes, NODES - 1))
+    return middle + half * nodes, at
 
 
 def _bow(patch: _Patch, levels: Floats, frame: Floats) -> float:
@@ -206,22 +227,21 @@ def fit_tag(
     middle, half = corners.mean(axis=0), 0.5 * float(edges.mean())
     frame = np.array([*middle, half, rim])
     _, px_from_ideal = measured_pixels(middle[None], intrinsics)
-    per_pixel = 1 if edges.min() > LARGE_TAG_PX else 2
-    patch = _Patch(picture, seed_px, intrinsics, rim * cell + 2.0, per_pixel, 1.2)
+    patch = _Patch(picture, seed_px, intrinsics, rim * cell + 2.0, 1.2)
     dark, bright = np.quantile(patch.grey, [0.1, 0.9])
     contrast = max(float(bright - dark), 1.0)
     levels, sigma = np.array([dark, bright, bright, 0.0, 0.0]), START_SIGMA_PX
     normal, right = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
     covariance, chi2, pixels, converged, iteration = np.full((14, 14), np.inf), np.inf, 0, False, 0
     # Sub-pixels under distortion are larger or smaller in ideal pixels by the lens's local scale.
-    side = 1.0 / (per_pixel * np.sqrt(abs(float(np.linalg.det(px_from_ideal[0])))))
+    side = 1.0 / (SUBPIXELS * np.sqrt(abs(float(np.linalg.det(px_from_ideal[0])))))
     while iteration < max_iterations and not converged:
         iteration += 1
         px_from_tag, change = homography(corners)
         tag_from_px = np.linalg.inv(px_from_tag)
         cover(patch.fine[..., 0], patch.fine[..., 1], tag_from_px, cells, side, patch.layers)
-        taps = kernels(sigma, patch.per_pixel, patch.reach, _smoothed(corners))
-        blur(patch.layers, taps, patch.per_pixel, levels[0], levels[1], levels[2], patch.model)
+        taps = kernels(sigma, SUBPIXELS, min(kernel_reach(sigma, SUBPIXELS), patch.reach), _smoothed(corners))
+        blur(patch.layers, taps, SUBPIXELS, levels[0], levels[1], levels[2], patch.model)
         chi2, pixels = _normal_equations(
             patch.grey, patch.centres, patch.model, px_from_tag, tag_from_px, px_from_ideal[0], levels, frame,
             np.array([gain, floor]), patch.inside, iteration <= CHOOSING, normal, right,
@@ -250,11 +270,9 @@ def fit_tag(
         levels += step[8:13]
         levels[3:] = np.clip(levels[3:], -0.8, 0.8)
         sigma = float(np.clip(sigma + np.clip(step[13], -0.3, 0.3), 0.25, 6.0))
-        if sigma > patch.sigma_limit or (patch.per_pixel == 1 and sigma < SHARPEST_COARSE_PX):
-            fine = 2 if sigma < SHARPEST_COARSE_PX else patch.per_pixel
-            side *= patch.per_pixel / fine
+        if sigma > patch.sigma_limit:
             inside = patch.inside
-            patch = _Patch(picture, seed_px, intrinsics, rim * cell + 2.0, fine, max(1.2, 1.4 * sigma))
+            patch = _Patch(picture, seed_px, intrinsics, rim * cell + 2.0, 1.4 * sigma)
             patch.inside = inside
             continue
         converged = iteration > 3 and moved < tolerance_px

@@ -25,7 +25,7 @@ LEANING = 4.0  # an edge that leans by 1/LEANING against the grid needs no smoot
 
 def kernel_reach(sigma: float, per_pixel: int) -> int:
     """Return the sub-pixels beyond a pixel that ``kernels`` of a Gaussian up to ``sigma`` needs."""
-    return int(np.ceil(4.0 * sigma * per_pixel))
+    return int(np.ceil(4.5 * sigma * per_pixel))
 
 
 def kernels(sigma: float, per_pixel: int, reach: int, smoothed: float = 0.0) -> Floats:
@@ -105,15 +105,49 @@ def _smooth(t: float, wide: float, narrow: float, box: float) -> float:
 
 
 @part(fastmath=FAST)
-def _span(t: float, wide: float, narrow: float, box: float, shares: Floats) -> int:
-    """Fill ``shares`` with the shares of a sub-pixel centred at t in consecutive cells; return the first cell."""
-    first = int(np.floor(t - 0.5 * (wide + narrow) - box))
+def _density(t: float, wide: float, narrow: float, box: float) -> float:
+    """Density of that trapezoid and boxes at t, over a quarter of its width."""
+    step = 0.125 * wide
+    return float((_smooth(t + step, wide, narrow, box) - _smooth(t - step, wide, narrow, box)) / (2.0 * step))
+
+
+@part(fastmath=FAST)
+def _span(t: float, wide: float, narrow: float, box: float, shares: Floats) -> tuple[int, int]:
+    """Fill ``shares`` with the shares of a sub-pixel centred at t in consecutive cells; return the first, how many."""
+    half = 0.5 * (wide + narrow) + box
+    first = int(np.floor(t - half))
+    count = min(int(np.floor(t + half)) - first + 1, len(shares))
     before = 0.0
-    for index in range(len(shares)):
+    for index in range(count - 1):
         upto = _smooth(first + index + 1.0 - t, wide, narrow, box)
         shares[index] = upto - before
         before = upto
-    return first
+    shares[count - 1] = 1.0 - before
+    return first, count
+
+
+@part(fastmath=FAST)
+def _widest(grid_x: Floats, grid_y: Floats, m: Floats, axis: int, h: float) -> float:
+    """Return a bound on how far from an edge, in cells, any sub-pixel of the grid may lie and still touch it.
+
+    du/dx and du/dy are linear functions of x and y over the square of the homography's denominator: numerators and
+    denominator are extreme at the grid's corners. A tenth is left for the lens.
+    """
+    low, high, depth_low = np.full(2, np.inf), np.full(2, -np.inf), np.inf
+    for r in (0, grid_x.shape[0] - 1):
+        for c in (0, grid_x.shape[1] - 1):
+            x, y = grid_x[r, c], grid_y[r, c]
+            depth = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+            at = m[axis, 0] * x + m[axis, 1] * y + m[axis, 2]
+            depth_low = min(depth_low, abs(depth))
+            for k in range(2):
+                slope = m[axis, k] * depth - at * m[2, k]
+                low[k], high[k] = min(low[k], slope), max(high[k], slope)
+    most_x, most_y = max(high[0], -low[0]), max(high[1], -low[1])
+    least = max(min(max(low[0], -high[0]), max(low[1], -high[1])), 0.0)
+    wide, narrow = max(most_x, most_y), min(most_x, most_y)
+    reach = 0.5 * (wide + narrow) + max(wide - LEANING * least, 0.0)
+    return float(1.1 * reach / (depth_low * depth_low) * h)
 
 
 @entry(fastmath=FAST)
@@ -130,39 +164,55 @@ def cover(
     rows, columns = grid_x.shape
     m = tag_from_px
     share_u, share_v = np.empty(6), np.empty(6)
+    clear_u, clear_v = _widest(grid_x, grid_y, m, 0, h), _widest(grid_x, grid_y, m, 1, h)
     for r in range(rows):
         for c in range(columns):
             x, y = grid_x[r, c], grid_y[r, c]
             w = 1.0 / (m[2, 0] * x + m[2, 1] * y + m[2, 2])
             u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) * w
             v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) * w
-            ux, uy = abs(m[0, 0] - u * m[2, 0]) * abs(w) * h, abs(m[0, 1] - u * m[2, 1]) * abs(w) * h
-            vx, vy = abs(m[1, 0] - v * m[2, 0]) * abs(w) * h, abs(m[1, 1] - v * m[2, 1]) * abs(w) * h
-            wide_u, narrow_u = max(ux, uy, 1e-9), max(min(ux, uy), 1e-9)
-            wide_v, narrow_v = max(vx, vy, 1e-9), max(min(vx, vy), 1e-9)
-            box_u, box_v = further_box(wide_u, narrow_u), further_box(wide_v, narrow_v)
-            half_u, half_v = 0.5 * (wide_u + narrow_u) + box_u, 0.5 * (wide_v + narrow_v) + box_v
             column, row = int(np.floor(u)), int(np.floor(v))
-            if u - column > half_u and column + 1 - u > half_u and v - row > half_v and row + 1 - v > half_v:
+            if clear_u < u - column < 1.0 - clear_u and clear_v < v - row < 1.0 - clear_v:
                 beyond = row < -1 or row > 8 or column < -1 or column > 8
                 quiet = row == -1 or row == 8 or column == -1 or column == 8
                 layers[1, r, c] = 1.0 if beyond else 0.0
                 layers[0, r, c] = 0.0 if beyond else (1.0 if quiet else float(cells[row, column]))
                 continue
-            first_u = _span(u, wide_u, narrow_u, box_u, share_u)
-            first_v = _span(v, wide_v, narrow_v, box_v, share_v)
-            count_u = int(np.floor(u + half_u)) - first_u + 1
-            count_v = int(np.floor(v + half_v)) - first_v + 1
+            ux, uy = abs(m[0, 0] - u * m[2, 0]) * abs(w) * h, abs(m[0, 1] - u * m[2, 1]) * abs(w) * h
+            vx, vy = abs(m[1, 0] - v * m[2, 0]) * abs(w) * h, abs(m[1, 1] - v * m[2, 1]) * abs(w) * h
+            wide_u, narrow_u = max(ux, uy, 1e-9), max(min(ux, uy), 1e-9)
+            wide_v, narrow_v = max(vx, vy, 1e-9), max(min(vx, vy), 1e-9)
+            box_u, box_v = further_box(wide_u, narrow_u), further_box(wide_v, narrow_v)
+            first_u, count_u = _span(u, wide_u, narrow_u, box_u, share_u)
+            first_v, count_v = _span(v, wide_v, narrow_v, box_v, share_v)
             white, outside = 0.0, 0.0
-            for j in range(min(count_v, 6)):
+            for j in range(count_v):
                 row = first_v + j
-                for i in range(min(count_u, 6)):
+                for i in range(count_u):
                     column = first_u + i
                     share = share_u[i] * share_v[j]
                     if row < -1 or row > 8 or column < -1 or column > 8:
                         outside += share
                     elif row == -1 or row == 8 or column == -1 or column == 8 or cells[row, column] == 1:
                         white += share
+            if count_u > 1 and count_v > 1:
+                # u and v vary together in a sub-pixel that the tag's tilt shears: E = uv-covariance x both densities.
+                together = (
+                    (m[0, 0] - u * m[2, 0]) * (m[1, 0] - v * m[2, 0])
+                    + (m[0, 1] - u * m[2, 1]) * (m[1, 1] - v * m[2, 1])
+                ) * (w * w * h * h / 12.0)
+                for i in range(count_u - 1):
+                    slope_u = _density(first_u + i + 1.0 - u, wide_u, narrow_u, box_u)
+                    for j in range(count_v - 1):
+                        slope_v = _density(first_v + j + 1.0 - v, wide_v, narrow_v, box_v)
+                        extra = together * slope_u * slope_v
+                        for k in range(4):
+                            column, row = first_u + i + (k & 1), first_v + j + (k >> 1)
+                            sign = 1.0 if k == 0 or k == 3 else -1.0
+                            if row < -1 or row > 8 or column < -1 or column > 8:
+                                outside += sign * extra
+                            elif row == -1 or row == 8 or column == -1 or column == 8 or cells[row, column] == 1:
+                                white += sign * extra
             layers[0, r, c] = white
             layers[1, r, c] = outside
 
@@ -174,7 +224,8 @@ def blur(
     """Blur the layers and form the derivatives of the grey-level image.
 
     Args:
-        layers: (2, r·s + taps - s, c·s + taps - s) from ``cover``.  taps: (3, taps) from ``kernels``.
+        layers: (2, r·s + 2 reach, c·s + 2 reach) from ``cover``.  taps: (3, taps) from ``kernels``, of that reach or
+            a shorter one.
         out: (5, r, c) filled with: white share, surround share, and of the image black + (white - black)·white share
             + (surround - black)·surround share the derivatives along x, along y, and by sigma.
     """
@@ -182,11 +233,12 @@ def blur(
     count, fine_columns = taps.shape[1], layers.shape[2]
     line = np.empty((4, fine_columns))
     up, beyond = white - black, surround - black
+    skipped = (layers.shape[1] - (rows - 1) * per_pixel - count) // 2
     for r in range(rows):
         line[:] = 0.0
         for t in range(count):
             k0, k1, k2 = taps[0, t], taps[1, t], taps[2, t]
-            source = r * per_pixel + t
+            source = r * per_pixel + skipped + t
             for c in range(fine_columns):
                 a, b = layers[0, source, c], layers[1, source, c]
                 mixed = up * a + beyond * b
@@ -198,7 +250,7 @@ def blur(
             p = s = dx = dy = ds = 0.0
             for t in range(count):
                 k0, k1, k2 = taps[0, t], taps[1, t], taps[2, t]
-                at = c * per_pixel + t
+                at = c * per_pixel + skipped + t
                 a, b = line[0, at], line[1, at]
                 mixed = up * a + beyond * b
                 p += k0 * a

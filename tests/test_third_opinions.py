@@ -31,10 +31,10 @@ from tests.bundle_cases import (
 SIGMA = 0.1
 
 
-def _colmap(poses, points, observations):
+def _colmap(poses, points, observations, intrinsics=INTRINSICS):
     reconstruction = pycolmap.Reconstruction()
     reconstruction.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=1, model="OPENCV", width=2448, height=2048, params=INTRINSICS)
+        pycolmap.Camera(camera_id=1, model="OPENCV", width=2448, height=2048, params=intrinsics)
     )
     for j, xyz in enumerate(points):
         reconstruction.add_point3D_with_id(j + 1, pycolmap.Point3D(xyz=xyz))

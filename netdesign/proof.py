@@ -24,7 +24,7 @@ from netdesign.files.adjustment import absolute_payload, adjustment_payload, len
 from netdesign.files.design_json import PlannedNetwork
 from netdesign.files.store import read_json, write_json, write_text
 from netdesign.imageset import image_name, measure_images, observations_of, render_images
-from netdesign.imaging.measure import Gates
+from netdesign.imaging.measure import Gates, TagMeasurement
 from netdesign.imaging.photograph import RendererName, Shoot
 from netdesign.model.adjustment import Adjustment
 from netdesign.model.arrays import Floats
@@ -32,14 +32,15 @@ from netdesign.model.frames import exp_rotation, pose
 from netdesign.model.network import Observations
 from netdesign.model.progress import Progress, silent
 from netdesign.model.results import PointPrecision
-from netdesign.model.scene import CORNERS_PER_TAG
+from netdesign.model.scene import CORNERS_PER_TAG, Targets
 from netdesign.model.task import Task
 from netdesign.photogrammetry.limited_error import limited_covariance
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_error import total_covariance
 from netdesign.photogrammetry.visibility import sightings
 
-CELLS = 8  # of a tag36h11's black square along an edge
+# The detector's own limits; which tags are wanted is for the plan to say, up to 70 deg and a robot's error.
+GATES = Gates(max_incidence=float(np.radians(71.0)))
 OUTLIER_SIGNIFICANCE = 1e-4  # data snooping at 1e-3 would bias s0² by 0.7 %
 
 
@@ -84,14 +85,16 @@ def prove_network(
     names = [image_name(index) for index in range(len(network.world_from_cam))]
     point_ids = task.scene.targets.point_ids
     paths = photograph(task, network, folder, repeat, executor)
-    measured = measure_images(paths, task.camera, task.scene.targets, gates=_gates(task), executor=executor)
-    observations, tag_covariances, unused = observations_of(measured, task.scene.targets)
+    measured = measure_images(paths, task.camera, task.scene.targets, gates=GATES, executor=executor)
+    observations, tag_covariances, unused = observations_of(_as_planned(task, network, measured), task.scene.targets)
+    observations, tag_covariances, alone = _intersected(observations, tag_covariances, task.scene.targets)
     write_text(folder / "observations.csv", observations_csv(observations, names, point_ids))
     record: dict[str, Any] = {
         "network": network.id,
         "repeat": repeat,
         "plan": _plan_key(network),
         "tags_not_used": unused,
+        "tags_not_measured": alone,
         "image_points": len(observations),
     }
     try:
@@ -108,6 +111,7 @@ def prove_network(
         record |= {"verdict": "failed", "passed": False, "reasons": [str(error)], "warnings": []}
     else:
         record |= validation_payload(validation, point_ids) | lengths | absolute
+        record["warnings"] = [*record["warnings"], *alone]
         record["verdict"] = "pass" if validation.passed else "fail"
         record["rejected_image_points"] = len(adjustment.rejected)
         write_json(
@@ -138,7 +142,7 @@ def is_proved(task: Task, network: PlannedNetwork, folder: Path) -> bool:
         record = read_json(folder / "validation.json", "network-validation")
     except InputError:
         return False
-    complete = record.get("verdict") == "failed" or "log_rho_expected" in record  # absent in earlier versions
+    complete = "tags_not_measured" in record  # absent in earlier versions
     return bool(complete and record.get("study_sha256") == task.sha256 and record.get("plan") == _plan_key(network))
 
 
@@ -201,15 +205,43 @@ def _by_image_and_tag(observations: Observations, covariances: list[Floats]) -> 
     return dict(zip(keys, covariances, strict=True))
 
 
-def _gates(task: Task) -> Gates:
-    """Return the gates of the measurement: a tag that the design does not count on is not used either."""
-    usual, limits = Gates(), task.limits
-    return replace(
-        usual,
-        max_incidence=min(usual.max_incidence, limits.max_incidence),
-        min_cell_px=max(usual.min_cell_px, limits.min_tag_px / CELLS),
-        border_px=max(usual.border_px, limits.border_px),
+def _as_planned(
+    task: Task, network: PlannedNetwork, measured: list[list[TagMeasurement]]
+) -> list[list[TagMeasurement]]:
+    """Return the measurements with a reason against those that the plan does not count on.
+
+    What the plan counts on is decided at the planned stations: a robot that stands a tenth of a degree off must not
+    turn a planned sighting at the limit of incidence into none.
+    """
+    planned = sightings(task.scene, task.camera, network.world_from_cam, task.limits).visible_tags
+    row = {tag: index for index, tag in enumerate(task.scene.targets.ids.tolist())}
+
+    def judged(image: int, tag: TagMeasurement) -> TagMeasurement:
+        wanted = tag.rejected or planned[image, row[tag.tag_id]]
+        return tag if wanted else replace(tag, rejected="not counted on by the plan")
+
+    return [[judged(image, tag) for tag in tags] for image, tags in enumerate(measured)]
+
+
+def _intersected(
+    observations: Observations, covariances: list[Floats], targets: Targets
+) -> tuple[Observations, list[Floats], list[str]]:
+    """Return the observations without tags that one image alone shows, and what those are: they have no position."""
+    tag = observations.point[::CORNERS_PER_TAG] // CORNERS_PER_TAG
+    images = np.bincount(tag, minlength=len(targets.ids))
+    kept = images[tag] > 1
+    rows = np.repeat(kept, CORNERS_PER_TAG)
+    left = Observations(
+        image=observations.image[rows],
+        point=observations.point[rows],
+        xy_px=observations.xy_px[rows],
+        covariance=observations.covariance[rows],
     )
+    alone = [
+        f"tag {targets.ids[index]}: measured in {images[index]} image(s), at least 2 needed"
+        for index in np.flatnonzero(images < 2)
+    ]
+    return left, [item for item, keep in zip(covariances, kept, strict=True) if keep], alone
 
 
 def _plan_key(network: PlannedNetwork) -> str:

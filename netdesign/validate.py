@@ -19,7 +19,10 @@ from netdesign.model.task import Task
 from netdesign.proof import is_proved, photograph, prove_network
 from netdesign.run_folder import open_run
 
-FAMILY_LEVEL = 0.99  # of all intervals of a campaign together: each network's is Bonferroni's share
+# Of all deciding intervals of a campaign together; each has Bonferroni's share: right predictions fail anywhere in a
+# whole campaign with a probability of at most one per cent.
+FAMILY_LEVEL = 0.99
+DECIDING = 3  # T, F and rho of every realisation
 POOLED = ("network", "repeat", "verdict", "reasons", "warnings", "predicted_rms_um", "achieved_rms_um", "statistics")
 
 
@@ -67,8 +70,8 @@ def validate_run(
     for number in numbers or []:
         find_network(run, number)
     chosen = sorted(set(networks if numbers is None else numbers))
-    level = 1.0 - (1.0 - FAMILY_LEVEL) / max(len(networks), 1)
     repeats = range(task.study.validation.repeats)
+    level = 1.0 - (1.0 - FAMILY_LEVEL) / (DECIDING * max(len(networks) * len(repeats), 1))
     with executor_of(workers, dask) as executor:
         for done, number in enumerate(chosen):
             progress("validate", done, len(chosen), f"network {number}")

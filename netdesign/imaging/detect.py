@@ -92,7 +92,9 @@ def _detector(family: str, longer_side: int) -> "cv2.aruco.ArucoDetector":
     settings.relativeCornerRefinmentWinSize = 0.3
     settings.minMarkerPerimeterRate = SMALLEST_PERIMETER_PX / longer_side
     settings.minCornerDistanceRate = 0.02
-    settings.minMarkerDistanceRate = 0.02
+    # The outline of the quiet zone is a square too; outlines nearer than this are taken together. At 0.02 one of sixty
+    # large tags, always the same ones, was lost to its own quiet zone.
+    settings.minMarkerDistanceRate = 0.125
     settings.errorCorrectionRate = 0.4
     return cv2.aruco.ArucoDetector(dictionary(family), settings)
 

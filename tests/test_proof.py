@@ -8,10 +8,12 @@ import pytest
 from netdesign.adjustment.diagnosis import SHARE_HARDLY_CHECKED, quality_warnings
 from netdesign.adjustment.estimate import estimate
 from netdesign.files.design_json import read_networks
+from netdesign.imaging.measure import TagMeasurement
 from netdesign.model.network import Observations
+from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.photogrammetry.collinearity import project
 from netdesign.placement.distances import network_total_error
-from netdesign.proof import _adjusted
+from netdesign.proof import _adjusted, _as_planned, _intersected
 from tests.bundle_cases import observe, problem_of, relief
 from tests.runs import convex_visible, ring_run
 
@@ -61,3 +63,36 @@ def test_a_few_hardly_checked_image_points_are_no_flag(share, told):
         problem, replace(adjustment, redundancy_numbers=numbers), (), nothing, nothing.astype(bool)
     )
     assert any("a gross error in them would hardly show" in text for text in warnings) == told
+
+
+def _tag(tag_id):
+    return TagMeasurement(
+        tag_id=tag_id, corners_px=np.zeros((4, 2)), covariance_px2=np.eye(8), rejected="", chi2_per_dof=1.0, pixels=900,
+        sigma_px=0.7, black=20.0, white=235.0, cell_px=5.0, incidence=0.1, seed_shift_px=0.3,
+    )  # fmt: skip
+
+
+def test_what_the_plan_does_not_count_on_is_not_used(proved):
+    task, network = proved
+    visible = convex_visible(task, network.world_from_cam)[:, ::CORNERS_PER_TAG]
+    ids = task.scene.targets.ids.tolist()
+    measured = [[_tag(tag) for tag in ids] for _ in network.world_from_cam]
+    used = [[not tag.rejected for tag in tags] for tags in _as_planned(task, network, measured)]
+    assert 0 < np.sum(used) < visible.size
+    np.testing.assert_array_equal(used, visible)
+
+
+def test_a_tag_of_one_image_is_left_out_by_name(proved):
+    task, _ = proved
+    ids = task.scene.targets.ids
+    image, tag = np.array([0, 1, 0, 2]), np.array([0, 0, 1, 2])  # of tag 0 two images, of the others at most one
+    point = (CORNERS_PER_TAG * tag[:, None] + np.arange(CORNERS_PER_TAG)).ravel()
+    observations = Observations(
+        image=np.repeat(image, CORNERS_PER_TAG), point=point, xy_px=np.zeros((16, 2)),
+        covariance=np.tile(np.eye(2), (16, 1, 1)),
+    )  # fmt: skip
+    left, covariances, alone = _intersected(observations, [k * np.eye(8) for k in range(4)], task.scene.targets)
+    assert left.point.tolist() == [0, 1, 2, 3] * 2
+    assert [matrix[0, 0] for matrix in covariances] == [0, 1]
+    assert alone[0] == f"tag {ids[1]}: measured in 1 image(s), at least 2 needed"
+    assert len(alone) == len(ids) - 1

@@ -56,6 +56,29 @@ def test_an_edit_of_a_part_is_noticed(tmp_path):
     assert said == [["2.5", "0"], ["2.5", "1"], ["3.5", "0"], ["3.25", "0"]]
 
 
+def test_a_kernel_kept_on_disk_serves_a_caller_compiled_anew_and_python(tmp_path):
+    kept = "from netdesign.model.compiled import entry\n\n@entry()\ndef twice(x):\n    return 2.0 * x\n"
+    caller = """
+from kept import twice
+from netdesign.model.compiled import entry
+
+@entry()
+def caller(x):
+    return twice(x) + {offset}
+
+print(caller(1.0), twice(3.0), sum(twice.stats.cache_hits.values()))
+"""
+    (tmp_path / "kept.py").write_text(kept, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    said = []
+    for offset in (0.5, 0.25):
+        (tmp_path / "caller.py").write_text(caller.format(offset=offset), encoding="utf-8")
+        command = [sys.executable, "-B", "caller.py"]
+        answer = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+        said.append(answer.stdout.split())
+    assert said == [["2.5", "6.0", "0"], ["2.25", "6.0", "1"]]
+
+
 def test_a_part_is_the_same_function_from_python_and_compiled():
     @part()
     def squared(x):

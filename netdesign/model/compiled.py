@@ -11,6 +11,7 @@ Numba keeps an entry until its own file changes. Here the key also holds every f
 and the constants it reads, so that an edit anywhere in a kernel is never answered by yesterday's machine code.
 """
 
+import gc
 import hashlib
 from collections.abc import Callable
 from functools import cache
@@ -159,18 +160,20 @@ class _EntryCompiler(Compiler):
         super().__init__(typingctx, targetctx, own, args, return_type, _Flags(flags), locals)
 
     def _compile_core(self) -> Any:
-        cpu, codegen = target_registry["cpu"], self.state.targetctx.codegen()
+        cpu = target_registry["cpu"]
         if jit_registry[cpu] is _part_of_numba:
             return super()._compile_core()
         jitter = jit_registry.pop(cpu)
         jit_registry[cpu] = _part_of_numba
-        codegen.create_library = lambda name: _PartLibrary(codegen, name)
+        collecting = gc.isenabled()
+        gc.disable()  # nearly all that a compiler makes stays: looking for waste takes a tenth of the time
         try:
             return super()._compile_core()
         finally:
+            if collecting:
+                gc.enable()
             del jit_registry[cpu]
             jit_registry[cpu] = jitter
-            del codegen.create_library
 
 
 class _PartCompiler(_EntryCompiler):

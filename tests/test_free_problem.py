@@ -11,9 +11,10 @@ from netdesign.errors import InputError
 from netdesign.model.camera import CornerNoise
 from netdesign.model.frames import look_at, sphere_directions
 from netdesign.model.stations import Depth
+from netdesign.photogrammetry.connectivity import loose_images
 from netdesign.photogrammetry.limited_error import limited_covariance
 from netdesign.photogrammetry.precision import sighting_sigma
-from netdesign.photogrammetry.visibility import sightings
+from netdesign.photogrammetry.visibility import Sight, sightings
 from netdesign.placement.encoding import Chromosomes
 from netdesign.placement.finish import finish
 from netdesign.placement.free_problem import FreeProblem, problem_of
@@ -89,13 +90,14 @@ def check_evaluation(task, problem):
     rng = np.random.default_rng(3)
     bits, genes = (np.concatenate(pair) for pair in zip(problem.random(rng, 30), problem.seeds(), strict=True))
     objectives, violation = problem.evaluate(bits, genes)
-    assert (violation <= 0).sum() >= 5
+    assert (violation <= 0).sum() >= 3
     for row in range(0, len(bits), 3):
         poses = problem.poses(genes[row][bits[row]])
         visible = sightings(task.scene, task.camera, poses, task.limits).visible
         if violation[row] >= 1:
             rays, points = visible.sum(axis=0), visible[len(task.existing) :].sum(axis=1)
-            assert (rays < task.limits.min_rays).any() or (points < task.limits.min_points_per_image).any()
+            lacking = (rays < task.limits.min_rays).any() or (points < task.limits.min_points_per_image).any()
+            assert lacking or loose_images(visible[:, ::4]) > 0
             continue
         sigma = sighting_sigma(task.camera, poses, task.scene.targets)
         covariance = limited_covariance(poses, task.scene.targets.points, task.camera.intrinsics, visible, sigma)
@@ -146,9 +148,15 @@ def test_depth_of_field_binds_a_free_radius():
     task = free_task(Depth(shape="ellipsoid", low=np.full(3, 0.3), high=np.full(3, 1.0)), max_images=5)
     task = replace(task, camera=camera)
     design = finish(problem_of(task), run(problem_of(task), "memetic", 20, 20, 1))
+    sight = Sight(task.scene, camera, task.limits)
+    points = task.scene.targets.points
     for network in design.networks:
-        assert network.radius.min() > near
-        assert network.precision.rays.min() >= 2
+        visible = sight.look(network.world_from_cam).visible
+        assert (visible.sum(axis=0) >= 2).all()
+        rays = points - network.world_from_cam[:, None, :3, 3]
+        depth = np.einsum("nmk,nk->nm", rays, network.world_from_cam[:, :3, 2])
+        assert near <= depth[visible].min()
+        assert depth[visible].max() <= far
 
 
 def off_sphere(count):

@@ -37,6 +37,17 @@ def components(visible: Bools) -> tuple[Ints, Ints]:
     return label[:images].astype(np.int64), label[images:].astype(np.int64)
 
 
+def loose_images(sees: Bools) -> int:
+    """Return how many images that see something share no tag with the first such, not even by way of others.
+
+    Args:
+        sees: (n, g) the tags that each image sees.
+    """
+    used = sees[sees.any(axis=1)]
+    label, _ = components(used)
+    return int((label != label[:1]).sum())
+
+
 def structure_complaints(
     visible: Bools, image_names: Sequence[str], point_names: Sequence[str], known: Bools | None = None
 ) -> tuple[str, ...]:

@@ -1,7 +1,8 @@
 """The search's evaluation of networks, compiled: visibility bits, limited error, tour, violation.
 
-A network's violation is the sum of what is missing: rays per tag, tags per image, stations out of reach, points whose
-rays are nearly parallel, and the part of the tour beyond the longest admissible one. Infeasible networks skip what
+A network's violation is the sum of what is missing: rays per tag, tags per image, images that hang together with the
+others, stations out of reach, points whose rays are nearly parallel, and the part of the tour beyond the longest
+admissible one. Infeasible networks skip what
 follows the first failing stage. What is reported is computed anew, exactly, in ``finish``.
 """
 
@@ -106,7 +107,35 @@ def missing_sightings(cells: Ints, tables: SphereTables, at_least: NDArray[np.ui
         for w in range(words):
             enough += popcount(at_least[r, w])
         lacking += tables.tags - enough
-    return lacking
+    return lacking if lacking > 0.0 else float(loose_images(cells, tables.sure, at_least[0]))
+
+
+@part()
+def loose_images(cells: Ints, sure: NDArray[np.uint64], reached: NDArray[np.uint64]) -> int:
+    """Return how many images, in ``cells`` (k,), share no tag with the first one, not even by way of others.
+
+    A bundle adjustment cannot tell where such images are. One tag in common is enough: its four corners fix a
+    similarity. Images that see nothing do not count. ``reached`` (words,): scratch.
+    """
+    reached[:] = np.uint64(0)
+    loose, before = 0, -1
+    while loose != before:
+        before, loose = loose, 0
+        empty = True
+        for w in range(len(reached)):
+            empty = empty and reached[w] == np.uint64(0)
+        for cell in cells:
+            common = own = np.uint64(0)
+            for w in range(len(reached)):
+                common |= sure[cell, w] & reached[w]
+                own |= sure[cell, w]
+            if common != np.uint64(0) or empty:
+                for w in range(len(reached)):
+                    reached[w] |= sure[cell, w]
+                empty = empty and own == np.uint64(0)
+            elif own != np.uint64(0):
+                loose += 1
+    return loose
 
 
 @part()

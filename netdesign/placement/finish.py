@@ -23,13 +23,17 @@ from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_error import total_covariance
 from netdesign.photogrammetry.total_trace import block_trace
 from netdesign.photogrammetry.visibility import Sight
-from netdesign.placement.decide import round_up
+from netdesign.placement.infeasible import why_infeasible
 from netdesign.placement.network_problem import NetworkProblem
 from netdesign.placement.tolerance import cheapest_admissible
 from netdesign.search.archive import non_dominated
-from netdesign.search.engine import run as search
 from netdesign.search.state import State
 
+UNDETERMINED = "not determined in total error propagation"
+_TOO_LOOSE = (
+    "; their images hang together by too few common points: viewpoints.max_images or visibility.max_incidence_deg"
+    " may have to grow"
+)
 LIMITED_DATUM = "fixed: the poses are error-free"
 COARSE = 25.0  # times the smallest f1 of a front: five times its sigma
 SPARE = 1.5  # networks computed exactly per network kept: some fall to exact rays or to domination
@@ -67,7 +71,8 @@ def finish(problem: NetworkProblem, state: State, progress: Progress = silent) -
     if best is not None:  # what dominates it without keeping the requirements is no answer
         networks = [network for network in networks if not _dominates(network, best)] + [best]
     if not networks:
-        raise InfeasibleError("no network of the search survived the exact check: " + _counts(dropped))
+        help_ = _TOO_LOOSE if dropped[UNDETERMINED] else ""
+        raise InfeasibleError(f"no network of the search survived the exact check: {_counts(dropped)}{help_}")
     objectives = np.array([[network.f1, network.f2, network.f3] for network in networks])
     kept = non_dominated(objectives)
     dropped["dominated once computed exactly"] += len(networks) - len(kept)
@@ -117,7 +122,7 @@ class Exact:
             return "a point whose rays are parallel"
         # Limited propagation is blind to images that hang together by too little: such a network has no accuracy.
         if total is None:
-            return "not determined in total error propagation"
+            return UNDETERMINED
         precision = total if task.study.objectives.propagation == "total" else limited
         f1 = precision.mean_variance
         if task.study.objectives.precision == "max_sigma":
@@ -238,50 +243,3 @@ def _notes(problem: NetworkProblem, networks: Sequence[DesignedNetwork], dropped
     if sum(dropped.values()):
         notes.append("left out of the front after the exact check: " + _counts(dropped))
     return notes
-
-
-def why_infeasible(problem: NetworkProblem, state: State) -> str:
-    """Return one line that says what the best network of a search without a feasible one still lacks."""
-    task, limits, slots = problem.task, problem.task.limits, problem.chromosomes.slots
-    cover = problem.cover
-    if cover.least > slots:
-        return (
-            f"viewpoints.max_images: over {cover.candidates} candidate stations at least"
-            f" {cover.least + len(task.existing)} images are needed to see every object point {limits.min_rays} times,"
-            f" allowed are {slots + len(task.existing)}"
-        )
-    best = int(np.argmin(state.population.violation))
-    viewpoints = state.population.genes[best][state.population.bits[best]]
-    sees = problem.sees(viewpoints)
-    lacking = sees.sum(axis=0) + problem.existing_sees.sum(axis=0) < limits.min_rays
-    parts = []
-    if lacking.any():
-        parts.append(f"{4 * lacking.sum()} of {4 * len(lacking)} object points have fewer than {limits.min_rays} rays")
-    poor = (sees.sum(axis=1) < problem.min_tags).sum()
-    if poor:
-        parts.append(f"{poor} of {len(viewpoints)} images see fewer than {limits.min_points_per_image} points")
-    if problem.joint_map is not None:
-        refused = (~problem.joint_map.reachable(viewpoints)).sum()
-        if refused:
-            parts.append(f"{refused} of {len(viewpoints)} stations are out of the robot's reach")
-    if not parts and task.study.requirements.max_tour is not None:
-        return f"requirements.max_tour: {_shortest(problem)}"
-    if not parts:
-        parts.append("some points are seen under nearly parallel rays")
-    return f"no admissible network among {state.evaluations[-1]} evaluated; of the nearest one " + ", ".join(parts)
-
-
-def _shortest(problem: NetworkProblem) -> str:
-    """What the tour takes at least: the same search without the limit."""
-    study = problem.task.study
-    free = problem.without_tour_limit()
-    found = search(free, study.search.engine, study.search.population, study.search.generations, study.seed)
-    asked = f"no admissible network with a tour of at most {study.requirements.max_tour:g}"
-    objectives = found.archive.members.objectives
-    if not len(objectives):
-        return f"{asked}, and none with a longer one"
-    best = objectives[np.argmin(objectives[:, 1])]
-    unit, scale = {"workspace": ("mm", 1e3), "joint": ("rad", 1.0), "time": ("s", 1.0)}[study.motion]
-    return (
-        f"{asked} {unit}; the shortest one found takes {round_up(scale * best[1]):g} {unit} with {int(best[2])} images"
-    )

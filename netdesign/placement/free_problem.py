@@ -15,6 +15,7 @@ from netdesign.model.progress import Progress, silent
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.motion.tour import path_length
+from netdesign.photogrammetry.connectivity import loose_images
 from netdesign.photogrammetry.limited_error import WEAK, variances_of
 from netdesign.photogrammetry.visibility import Sight
 from netdesign.placement.distances import named_ends
@@ -193,6 +194,8 @@ class FreeProblem(NetworkProblem):
             seen = np.array([station.sees.sum() for station in own], np.int64)
             lacking = np.maximum(limits.min_rays - rays, 0).sum() + np.maximum(1 - seen / self.min_tags, 0).sum()
             lacking += (~constraint[row][chosen]).sum()
+            if lacking == 0:
+                lacking = loose_images(np.array([station.sees for station in network]))
             if lacking > 0:
                 violation[row] = 1.0 + lacking
                 continue

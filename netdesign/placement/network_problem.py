@@ -119,6 +119,8 @@ class NetworkProblem(ABC):
         viewpoints = self.candidates()
         visible = np.repeat(self.sees(viewpoints), CORNERS_PER_TAG, axis=1)
         flat = information_of(self.task, self.task.sphere.cameras(viewpoints), visible)
+        # A point that hardly anything sees may be seen between the stations of the lattice only.
+        flat = flat.reshape(len(flat), -1, 6)[:, visible.any(axis=0)].reshape(len(flat), -1)
         first = max(len(self.cover.viewpoints), 1 if len(self.task.existing) else 2)
         return rounded_networks(viewpoints, flat, range(first, self.chromosomes.slots + 1), self.limited_scores)
 

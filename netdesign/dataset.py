@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from netdesign.files.calibrators import kalibr_camchain, kalibr_grid, opencv_camera, targets_csv
+from netdesign.files.calibrators import camera_toml, kalibr_camchain, kalibr_grid, opencv_camera, targets_csv
 from netdesign.files.recipe import ImageSetPlan, load_recipe
 from netdesign.files.store import write_bytes, write_text
 from netdesign.imageset import image_name, render_images, worker_pool
@@ -40,6 +40,7 @@ def _write_extras(plan: ImageSetPlan, out: Path) -> None:
     extras, targets = plan.recipe.extras, plan.scene.targets
     write_text(out / "README.txt", _about(plan))
     write_text(out / "targets.csv", targets_csv(targets))
+    write_text(out / "camera.toml", camera_toml(plan.camera, targets))
     if extras.kalibr:
         write_text(out / "camchain.yaml", kalibr_camchain(plan.camera))
         grid = kalibr_grid(targets)
@@ -68,7 +69,8 @@ images/*.png                        grey, {recipe.exposure.bits} bit, linear in 
 truth.json                          exact poses, points (mm) and corner coordinates per image
 corners.csv                         the same corner coordinates as a table
 cameras.txt images.txt points3D.txt the truth as a COLMAP text model (pixel origin 0.5, lengths in mm)
-targets.csv                         the tags: centre, normal and x axis in mm
+camera.toml targets.csv             the camera and the tags (centre, normal, x axis in mm): `netdesign adjust` on this
+                                    folder measures the photographs and starts from these
 camchain.yaml aprilgrid.yaml        for Kalibr, camera-opencv.yaml for OpenCV (when asked for)
 depth/*.npy masks/*.png             depth (float32, m) and tag id + 1 (16 bit) per pixel (when asked for)
 

@@ -10,6 +10,7 @@ truth.json says what it is, and every picture appears whole or not at all.
 
 import contextlib
 import multiprocessing
+import os
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
@@ -19,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from netdesign.errors import InputError
 from netdesign.files.colmap import ColmapModel, point3d_id, write_model
 from netdesign.files.noise import read_corner_noise
 from netdesign.files.store import write_bytes, write_json, write_text
@@ -75,8 +77,10 @@ def render_images(
         The n image paths.
 
     Raises:
+        InputError: ``out`` cannot be written, or holds pictures that are no image set of ours.
         EnvironmentProblem: the renderer's system libraries are missing.
     """
+    _check_folder(out)
     visible = sightings(scene, camera, world_from_cam, limits).visible
     xy_px, _ = project(world_from_cam[:, None], scene.targets.points[None], camera.intrinsics)
     paths = [out / "images" / image_name(index) for index in range(len(world_from_cam))]
@@ -87,6 +91,24 @@ def render_images(
     for _ in each(_render_one, jobs, executor, "render", progress):
         pass
     return paths
+
+
+def _check_folder(out: Path) -> None:
+    """Refuse a folder that cannot be made, or whose pictures would be lost.
+
+    Raises:
+        InputError: with what was found.
+    """
+    if not (out / "truth.json").is_file() and any((out / "images").glob("*")):
+        raise InputError(
+            f"{out}: expected an empty folder or an image set of netdesign, found pictures without truth.json"
+        )
+    try:
+        (out / "images").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: expected a folder that can be written, found: {error.strerror}") from None
+    if not os.access(out, os.W_OK):
+        raise InputError(f"{out}: expected a folder that can be written, found one that cannot")
 
 
 def measure_images(

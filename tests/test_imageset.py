@@ -196,3 +196,23 @@ def test_colmap_triangulates_and_adjusts_the_measured_corners(image_set, tmp_pat
     options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
     pycolmap.bundle_adjustment(model, options)
     assert model.compute_mean_reprojection_error() < 0.03
+
+
+def test_pictures_of_others_are_not_removed_and_a_file_is_no_folder(tmp_path):
+    mine = tmp_path / "images" / "mine.png"
+    mine.parent.mkdir()
+    mine.write_bytes(b"mine")
+    with pytest.raises(InputError, match="without truth"):
+        render_images(SCENE, CAM, EASY, POSES[:1], tmp_path, Shoot(renderer="reference"))
+    assert mine.read_bytes() == b"mine"
+    with pytest.raises(InputError, match="can be written"):
+        render_images(SCENE, CAM, EASY, POSES[:1], mine, Shoot(renderer="reference"))
+
+
+@pytest.mark.parametrize("line", ["poses.distance_mm = [700, 400]", "poses.distance_mm = [-9, 4]", "light.white = 3"])
+def test_recipes_with_impossible_values_are_refused(tmp_path, line):
+    study = (RECIPES[0].parents[1] / "studies" / "plate.toml").resolve()
+    recipe = tmp_path / "r.toml"
+    recipe.write_text(f'format = 1\nname = "r"\nstudy = "{study}"\n{line}\n')
+    with pytest.raises(InputError, match="expected"):
+        load_recipe(recipe)

@@ -76,3 +76,17 @@ def targets_csv(targets: Targets) -> str:
         values = np.concatenate([targets.centres[index] / MM, targets.normals[index], targets.x_axes[index]])
         lines.append(f"{tag}," + ",".join(f"{value:.9g}" for value in values))
     return "\n".join(lines) + "\n"
+
+
+def camera_toml(camera: Camera, targets: Targets) -> str:
+    """Return the camera.toml of an image set: what ``adjust`` needs to measure its photographs."""
+    return (
+        "[camera]\n"
+        f"width_px = {camera.width_px}\nheight_px = {camera.height_px}\n"
+        f"focal_px = [{_numbers(camera.focal_px)}]\n"
+        f"principal_point_px = [{_numbers(camera.principal_point_px)}]\n"
+        f"distortion = [{_numbers(camera.distortion)}]\n"
+        f"blur_px = {camera.blur_px!r}\nfull_well_e = {camera.full_well_e!r}\nread_noise_e = {camera.read_noise_e!r}\n"
+        f'\n[targets]\nfamily = "{targets.family}"\nsize_mm = {targets.size_m / MM!r}\n'
+        "\n[photographs]\ngamma = 1.0\n"
+    )

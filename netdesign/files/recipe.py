@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from netdesign.errors import InputError
 from netdesign.files.study import camera_of_table, load_task
@@ -17,11 +17,12 @@ from netdesign.model.arrays import Floats
 from netdesign.model.camera import Camera
 from netdesign.model.frames import look_at, pose, rotation_from_rpy, sphere_directions
 from netdesign.model.scene import Part, Scene, Targets
-from netdesign.model.study import CameraTable, NotNegative, Number, Positive, Range, Table, Vector3
+from netdesign.model.study import CameraTable, NotNegative, Number, Range, Table, Vector3
 from netdesign.model.task import VisibilityLimits
 
 MM = 1e-3
 POSE_COLUMNS = 6
+Level = Annotated[float, Field(ge=0, le=1)]
 LENS_SAMPLES = 32
 WAVELENGTH_M = 550e-9
 AIRY_SIGMA = 0.42  # sigma of the Gaussian nearest to an Airy disk, in wavelength x f-number
@@ -41,16 +42,28 @@ class PosesTable(Table):
         (), description="instead: x, y, z in mm and roll, pitch, yaw in deg (URDF order) of world_from_cam, per image"
     )
 
+    @model_validator(mode="after")
+    def _ordered(self) -> "PosesTable":
+        for name, least, largest in (
+            ("distance_mm", 1e-3, 1e9), ("azimuth_deg", -360, 360), ("elevation_deg", -90, 90), ("roll_deg", -360, 360)
+        ):  # fmt: skip
+            low, high = getattr(self, name)
+            if not least <= low <= high <= largest:
+                raise ValueError(
+                    f"{name}: expected low <= high from {least:g} to {largest:g}, found [{low:g}, {high:g}]"
+                )
+        return self
+
 
 class LightTable(Table):
     """[light]: linear levels, full scale 1."""
 
-    black: NotNegative = Appearance.black
-    white: Positive = Appearance.white
-    face: Positive = Appearance.face
+    black: Level = Appearance.black
+    white: Level = Appearance.white
+    face: Level = Appearance.face
     relief: NotNegative = Appearance.relief
     mottle: NotNegative = Field(0.0, description="random level of every face of the part, plus or minus")
-    background: NotNegative = Appearance.background
+    background: Level = Appearance.background
     vignetting: NotNegative = Field(0.0, description="exponent of the cosine law")
     gradient: tuple[Number, Number] = Field((0, 0), description="relative change across and down the picture")
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from netdesign.adjustment.estimate import estimate
+from netdesign.adjustment.nominal import misplaced_tags
 from netdesign.adjustment.problem import BundleProblem
 from netdesign.errors import InputError
 from netdesign.files.adjustment import adjustment_payload
@@ -23,6 +24,7 @@ from netdesign.files.store import plain, write_json
 from netdesign.model.adjustment import Adjustment, Datum
 from netdesign.model.arrays import Bools
 from netdesign.model.progress import Progress, silent
+from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.photo_set import is_photo_set, read_photo_set
 from netdesign.photogrammetry.connectivity import listed
 from netdesign.photogrammetry.observation_equations import parameter_matrix
@@ -74,7 +76,7 @@ def adjust_folder(
     if place.exists() and not place.is_dir():
         raise InputError(f"{place}: expected a folder to write adjustment.json into, found a file")
     progress("read", 0, 1)
-    found, blind, notes = _read(folder, sigma_px, tuple(refine or ()), progress)
+    found, blind, notes, on_nominal = _read(folder, sigma_px, tuple(refine or ()), progress)
     progress("read", 1, 1)
     control_path = _table(control, folder / "control.csv")
     bars_path = _table(scale_bars, folder / "scalebars.csv")
@@ -111,6 +113,8 @@ def adjust_folder(
     adjustment = estimate(problem, robust=robust, sigma_known=found.sigma_known, progress=iterated)
     progress("adjust", USUAL_ITERATIONS, USUAL_ITERATIONS)
     adjustment = replace(adjustment, warnings=(*notes, *_notes(problem, found), *adjustment.warnings))
+    if on_nominal:
+        adjustment = replace(adjustment, warnings=(*adjustment.warnings, *_misplaced(adjustment, found)))
     record = plain(adjustment_payload(adjustment, found.image_names, found.point_names))
     path = place / "adjustment.json"
     try:
@@ -123,17 +127,18 @@ def adjust_folder(
 
 def _read(
     folder: Path, sigma_px: float | None, refine: tuple[str, ...], progress: Progress
-) -> tuple[ObservationSet, tuple[str, ...], tuple[str, ...]]:
-    """Return what the folder holds, the images that were left out, and what is to be said about it."""
+) -> tuple[ObservationSet, tuple[str, ...], tuple[str, ...], bool]:
+    """Return what the folder holds, the images left out, what is to be said, and whether points are nominal tags."""
     if is_photo_set(folder):
         photos = read_photo_set(folder, sigma_px, progress, refine)
-        return photos.observations, (), photos.notes
+        return photos.observations, (), photos.notes, photos.on_nominal
     if any((folder / name).is_file() for name in MODEL_FILES):
         found, blind = read_observation_set(folder, sigma_px).without_blind_images()
         return (
             found,
             blind,
             (f"{len(blind)} image(s) without image points are left out: {listed(blind)}",) * bool(blind),
+            False,
         )
     raise InputError(
         f"{folder}: expected a COLMAP text model ({', '.join(MODEL_FILES)}) or camera.toml with photographs"
@@ -166,6 +171,19 @@ def _mask(names: Sequence[str] | None, point_names: Sequence[str]) -> Bools | No
     if unknown:
         raise InputError(f"datum-points: expected names of object points, found {unknown[0]!r}")
     return np.isin(np.array(point_names), np.array(names))
+
+
+def _misplaced(adjustment: Adjustment, found: ObservationSet) -> list[str]:
+    """Return which tags were not measured where targets.csv says, in one line or none."""
+    deviation, wrong = misplaced_tags(adjustment.points, found.points, adjustment.used)
+    tags = [name.partition(".")[0] for name in found.point_names[::CORNERS_PER_TAG]]
+    if not wrong.any():
+        return []
+    places = [f"{tag} ({1e3 * off:.1f} mm)" for tag, off, bad in zip(tags, deviation, wrong, strict=True) if bad]
+    return [
+        f"{len(places)} tag(s) lie far from their place in targets.csv, wrong ids or wrong nominal coordinates: "
+        f"{listed(places, 12)}"
+    ]
 
 
 def _notes(problem: BundleProblem, found: ObservationSet) -> list[str]:

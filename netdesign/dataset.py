@@ -46,18 +46,29 @@ def _write_extras(plan: ImageSetPlan, out: Path) -> None:
         grid = kalibr_grid(targets)
         if grid is not None:
             write_text(out / "aprilgrid.yaml", grid)
+    if plan.recipe.faults.wrong_ids:
+        write_text(out / "faults.csv", _wrong_ids(plan))
     if extras.opencv:
         write_text(out / "camera-opencv.yaml", opencv_camera(plan.camera))
     if extras.depth or extras.tag_mask:
-        reference = ReferenceRenderer(plan.drawn, plan.camera)
-        for index, world_from_cam in enumerate(plan.world_from_cam):
-            depth, tags = reference.depth_and_tags(inverse(world_from_cam))
+        for index, (scene, world_from_cam) in enumerate(zip(plan.drawn, plan.world_from_cam, strict=True)):
+            depth, tags = ReferenceRenderer(scene, plan.camera).depth_and_tags(inverse(world_from_cam))
             if extras.depth:
                 buffer = io.BytesIO()
                 np.save(buffer, depth)
                 write_bytes(out / "depth" / f"{index:04d}.npy", buffer.getvalue())
             if extras.tag_mask:
                 write_bytes(out / "masks" / image_name(index), png_bytes(tags))
+
+
+def _wrong_ids(plan: ImageSetPlan) -> str:
+    """Return which tags show another id, per image."""
+    true = plan.scene.targets.ids
+    lines = ["image,tag,shown_id"]
+    for index, scene in enumerate(plan.drawn):
+        shown = scene.targets.ids[: len(true)]
+        lines += [f"{image_name(index)},{true[row]},{shown[row]}" for row in np.flatnonzero(shown != true)]
+    return "\n".join(lines) + "\n"
 
 
 def _about(plan: ImageSetPlan) -> str:
@@ -76,6 +87,6 @@ depth/*.npy masks/*.png             depth (float32, m) and tag id + 1 (16 bit) p
 
 Pixel origin: the centre of the top-left pixel is (0, 0), except in the COLMAP model. Camera axes: x right, y down,
 z forward. Corners 0 to 3: top-left, top-right, bottom-right, bottom-left of the black square as OpenCV draws the tag.
-Faults made on purpose, unknown to the truth: {recipe.faults.wrong_ids} pairs of exchanged ids,
-{recipe.faults.glare} spots of glare per image, {recipe.faults.clutter} boxes with foreign tags.
+Faults made on purpose, unknown to the truth: {recipe.faults.wrong_ids} pairs of exchanged ids in some images
+(faults.csv), {recipe.faults.glare} spots of glare per image, {recipe.faults.clutter} boxes with foreign tags.
 """

@@ -63,7 +63,7 @@ def image_name(index: int) -> str:
 def render_images(
     scene: Scene, camera: Camera, limits: VisibilityLimits, world_from_cam: Floats, out: Path, shoot: Shoot, *,
     executor: Executor | None = None, progress: Progress = silent, study_sha256: str | None = None,
-    drawn: Scene | None = None,
+    drawn: Sequence[Scene] | None = None,
 ) -> list[Path]:  # fmt: skip
     """Render an image set: images/*.png, truth.json, corners.csv and a COLMAP text model.
 
@@ -71,7 +71,7 @@ def render_images(
 
     Args:
         world_from_cam: (n, 4, 4) m, the exact poses.
-        drawn: what stands before the camera if it differs from what the truth says (wrong ids, foreign tags).
+        drawn: what stands before the camera, per image, if it differs from the truth (wrong ids, foreign tags).
 
     Returns:
         The n image paths.
@@ -86,8 +86,9 @@ def render_images(
     paths = [out / "images" / image_name(index) for index in range(len(world_from_cam))]
     _write_truth(scene, camera, world_from_cam, visible, xy_px, out, shoot, study_sha256)
     missing = [index for index, path in enumerate(paths) if not path.is_file()]
-    session = pickle.dumps((drawn or scene, camera, shoot))
-    jobs = [(session, index, world_from_cam[index], paths[index]) for index in missing]
+    shown = drawn or [scene] * len(paths)
+    sessions = {id(item): pickle.dumps((item, camera, shoot)) for item in shown}
+    jobs = [(sessions[id(shown[index])], index, world_from_cam[index], paths[index]) for index in missing]
     for _ in each(_render_one, jobs, executor, "render", progress):
         pass
     return paths

@@ -43,10 +43,12 @@ class PhotoSet:
 
     Attributes:
         notes: images without tags, tags that were not believed.
+        on_nominal: the points are nominal coordinates, from targets.csv.
     """
 
     observations: ObservationSet
     notes: tuple[str, ...]
+    on_nominal: bool
 
 
 def is_photo_set(folder: Path) -> bool:
@@ -96,7 +98,7 @@ def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress, ref
         found, left_out = _tied(_on_nominal(kept, kept_names, camera, targets, sigma_px))
     else:
         found, left_out = _tied(_on_tags_alone(kept, kept_names, camera, targets, sigma_px, refine))
-    return PhotoSet(observations=found, notes=(*notes, *left_out))
+    return PhotoSet(observations=found, notes=(*notes, *left_out), on_nominal=known)
 
 
 def _tone(photos: Sequence[Path], camera: Camera, targets: Targets, stated: float | None) -> Tone:

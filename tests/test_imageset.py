@@ -154,7 +154,7 @@ def test_a_recipe_becomes_an_image_set(tmp_path):
                  "depth/0000.npy", "masks/0000.png", "images/0000.png", "truth.json"):  # fmt: skip
         assert (tmp_path / "out" / name).is_file()
     plan = load_recipe(recipe)
-    assert (plan.drawn.targets.ids[:25] != plan.scene.targets.ids).sum() == 2
+    assert (plan.drawn[0].targets.ids[:25] != plan.scene.targets.ids).sum() == 2
     recipe.write_text(text + "poses.imagse = 1\n")
     with pytest.raises(InputError, match="images"):
         load_recipe(recipe)

@@ -25,6 +25,7 @@ POSE_COLUMNS = 6
 Level = Annotated[float, Field(ge=0, le=1)]
 LENS_SAMPLES = 32
 WAVELENGTH_M = 550e-9
+WRONG_EVERY = 4  # pictures, one shows exchanged ids, another pair each time
 AIRY_SIGMA = 0.42  # sigma of the Gaussian nearest to an Airy disk, in wavelength x f-number
 
 
@@ -82,7 +83,9 @@ class ExposureTable(Table):
 class FaultsTable(Table):
     """[faults]: what goes wrong on purpose; the truth does not know of it."""
 
-    wrong_ids: Annotated[int, Field(ge=0)] = Field(0, description="pairs of tags that exchange their ids")
+    wrong_ids: Annotated[int, Field(ge=0)] = Field(
+        0, description="pairs of tags that exchange their ids, in some pictures"
+    )
     glare: Annotated[int, Field(ge=0)] = Field(0, description="spots of stray light per picture")
     clutter: Annotated[int, Field(ge=0)] = Field(0, description="boxes around the part, with foreign tags on top")
 
@@ -117,13 +120,13 @@ class ImageSetPlan:
     """A recipe in SI values.
 
     Attributes:
-        scene: what is claimed; drawn: what stands before the camera, faults included.
+        scene: what is claimed; drawn: what stands before the camera, faults included, per image.
         world_from_cam: (n, 4, 4) m.
     """
 
     recipe: Recipe
     scene: Scene
-    drawn: Scene
+    drawn: tuple[Scene, ...]
     camera: Camera
     limits: VisibilityLimits
     world_from_cam: Floats
@@ -160,10 +163,11 @@ def load_recipe(path: Path, renderer: RendererName = "pyrender") -> ImageSetPlan
         ),
     )  # fmt: skip
     random = np.random.default_rng([recipe.seed, 2])
-    solid, drawn = _with_faults(task.scene, recipe.faults, random)
+    stations = _stations(recipe.poses, np.random.default_rng([recipe.seed, 3]))
+    solid, drawn = _with_faults(task.scene, recipe.faults, len(stations), random)
     return ImageSetPlan(
         recipe=recipe, scene=solid, drawn=drawn, camera=camera, limits=task.limits,
-        world_from_cam=_stations(recipe.poses, np.random.default_rng([recipe.seed, 3])), shoot=shoot,
+        world_from_cam=stations, shoot=shoot,
     )  # fmt: skip
 
 
@@ -192,8 +196,10 @@ def _stations(table: PosesTable, random: np.random.Generator) -> Floats:
     return look_at(aim + distance[:, None] * sphere_directions(viewpoints), aim, roll)
 
 
-def _with_faults(scene: Scene, faults: FaultsTable, random: np.random.Generator) -> tuple[Scene, Scene]:
-    """Return the scene as claimed, with clutter that may hide tags, and the scene as drawn."""
+def _with_faults(
+    scene: Scene, faults: FaultsTable, images: int, random: np.random.Generator
+) -> tuple[Scene, tuple[Scene, ...]]:
+    """Return the scene as claimed, with clutter that may hide tags, and per image the scene as drawn."""
     part, targets = scene.part, scene.targets
     foreign = np.setdiff1d(np.arange(587), targets.ids)[: faults.clutter]
     centres, heights = [], []
@@ -213,16 +219,20 @@ def _with_faults(scene: Scene, faults: FaultsTable, random: np.random.Generator)
         centres.append(centre)
         heights.append(size[2] / 2)
     solid = Part(vertices=np.concatenate(vertices), faces=np.concatenate(faces))
-    ids = targets.ids.copy()
-    chosen = random.permutation(len(ids))[: 2 * faults.wrong_ids]
-    ids[chosen] = targets.ids[chosen[::-1]]
-    drawn = replace(targets, ids=ids)
+    drawn = targets
     if len(foreign):
         tops = np.array(centres)[: len(foreign)] + np.array(heights)[: len(foreign), None] * np.array([0, 0, 1.0])
         drawn = Targets(
-            ids=np.concatenate([ids, foreign]), centres=np.concatenate([targets.centres, tops]),
+            ids=np.concatenate([targets.ids, foreign]), centres=np.concatenate([targets.centres, tops]),
             normals=np.concatenate([targets.normals, np.tile([0.0, 0, 1], (len(foreign), 1))]),
             x_axes=np.concatenate([targets.x_axes, np.tile([1.0, 0, 0], (len(foreign), 1))]),
             size_m=targets.size_m, family=targets.family,
         )  # fmt: skip
-    return Scene(part=solid, targets=targets), Scene(part=solid, targets=drawn)
+    shown = [Scene(part=solid, targets=drawn)] * images
+    # In every picture alike they would be no outliers but two tags, each well measured at the other's place.
+    for image in random.permutation(images)[: -(-images // WRONG_EVERY)] if faults.wrong_ids else ():
+        ids = drawn.ids.copy()
+        chosen = random.permutation(len(targets.ids))[: 2 * faults.wrong_ids]
+        ids[chosen] = ids[chosen[::-1]]
+        shown[image] = Scene(part=solid, targets=replace(drawn, ids=ids))
+    return Scene(part=solid, targets=targets), tuple(shown)

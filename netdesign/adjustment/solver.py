@@ -22,6 +22,8 @@ CAUCHY = 2.3849
 MOST_ITERATIONS = 200
 FIRST_DAMPING = 1e-6
 CLOSE = 1e-3  # length of a step, in standard deviations, from which on the cost no longer judges it
+SETTLED = 0.1  # length of a robust step, in standard deviations, from which on a cost that hardly falls ends it
+HARDLY = 1e-2, 1e-6  # what a robust step must still take off the cost, absolute and of the cost
 STEP = 1e-7  # length of the last Gauss-Newton step, in standard deviations of all unknowns together
 
 
@@ -209,7 +211,11 @@ def solve(problem: BundleProblem, robust: bool = False, progress: Iterations = u
             gain = 1.0 if misclosed else (cost - new_cost) / max(decrement**2, 1e-300)
             damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3) if gain < 1.0 else 0.1
             damping, raise_by = damping if damping > 1e-12 else 0.0, 4.0
+            # Reweighting converges but linearly, and in a weak network hardly at all; it is a start, not an estimate.
+            settled = robust and decrement < SETTLED and cost - new_cost < max(HARDLY[0], HARDLY[1] * cost)
             problem, squared, cost, extra, linearised = candidate, new_squared, new_cost, new_extra, None
+            if settled and not misclosed:
+                return solution_at(problem, iteration)
         else:
             damping, raise_by = max(damping, 1e-10) * raise_by, 2.0 * raise_by
         if damping > 1e12:

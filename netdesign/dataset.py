@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from netdesign.files.calibrators import camera_toml, kalibr_camchain, kalibr_grid, opencv_camera, targets_csv
+from netdesign.files.calibrators import kalibr_camchain, kalibr_grid, opencv_camera
+from netdesign.files.image_folder import complete_image_folder
 from netdesign.files.recipe import ImageSetPlan, load_recipe
 from netdesign.files.store import write_bytes, write_text
 from netdesign.imageset import image_name, render_images, worker_pool
@@ -38,14 +39,12 @@ def render_dataset(
 def _write_extras(plan: ImageSetPlan, out: Path) -> None:
     """Write what the recipe asks for beside the images, and a README that says what everything is."""
     extras, targets = plan.recipe.extras, plan.scene.targets
-    write_text(out / "README.txt", _about(plan))
-    write_text(out / "targets.csv", targets_csv(targets))
-    write_text(out / "camera.toml", camera_toml(plan.camera, targets))
     if extras.kalibr:
         write_text(out / "camchain.yaml", kalibr_camchain(plan.camera))
         grid = kalibr_grid(targets)
         if grid is not None:
             write_text(out / "aprilgrid.yaml", grid)
+    (out / "faults.csv").unlink(missing_ok=True)
     if plan.recipe.faults.wrong_ids:
         write_text(out / "faults.csv", _wrong_ids(plan))
     if extras.opencv:
@@ -59,6 +58,9 @@ def _write_extras(plan: ImageSetPlan, out: Path) -> None:
                 write_bytes(out / "depth" / f"{index:04d}.npy", buffer.getvalue())
             if extras.tag_mask:
                 write_bytes(out / "masks" / image_name(index), png_bytes(tags))
+    title = f"{plan.recipe.name}: {len(plan.world_from_cam)} synthetic images made by netdesign. {plan.recipe.about}"
+    bits = plan.recipe.exposure.bits
+    complete_image_folder(out, plan.camera, targets, title=title.strip(), bits=bits, faults=_faults(plan))
 
 
 def _wrong_ids(plan: ImageSetPlan) -> str:
@@ -71,22 +73,13 @@ def _wrong_ids(plan: ImageSetPlan) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _about(plan: ImageSetPlan) -> str:
-    """Return the README of an image set."""
-    recipe = plan.recipe
-    return f"""{recipe.name}: {len(plan.world_from_cam)} synthetic images made by netdesign. {recipe.about}
-
-images/*.png                        grey, {recipe.exposure.bits} bit, linear in light
-truth.json                          exact poses, points (mm) and corner coordinates per image
-corners.csv                         the same corner coordinates as a table
-cameras.txt images.txt points3D.txt the truth as a COLMAP text model (pixel origin 0.5, lengths in mm)
-camera.toml targets.csv             the camera and the tags (centre, normal, x axis in mm): `netdesign adjust` on this
-                                    folder measures the photographs and starts from these
-camchain.yaml aprilgrid.yaml        for Kalibr, camera-opencv.yaml for OpenCV (when asked for)
-depth/*.npy masks/*.png             depth (float32, m) and tag id + 1 (16 bit) per pixel (when asked for)
-
-Pixel origin: the centre of the top-left pixel is (0, 0), except in the COLMAP model. Camera axes: x right, y down,
-z forward. Corners 0 to 3: top-left, top-right, bottom-right, bottom-left of the black square as OpenCV draws the tag.
-Faults made on purpose, unknown to the truth: {recipe.faults.wrong_ids} pairs of exchanged ids in some images
-(faults.csv), {recipe.faults.glare} spots of glare per image, {recipe.faults.clutter} boxes with foreign tags.
-"""
+def _faults(plan: ImageSetPlan) -> str:
+    """Return what is wrong on purpose, for the README of the set; nothing if nothing is."""
+    faults = plan.recipe.faults
+    wrong = (
+        (faults.wrong_ids, f"{faults.wrong_ids} pair(s) of exchanged ids in some images (faults.csv)"),
+        (faults.glare, f"{faults.glare} spot(s) of glare per image"),
+        (faults.clutter, f"{faults.clutter} box(es) with foreign tags"),
+    )
+    named = [text for count, text in wrong if count]
+    return f"Faults made on purpose, unknown to the truth:\n{', '.join(named)}.\n" if named else ""

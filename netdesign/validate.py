@@ -11,9 +11,10 @@ from netdesign.adjustment.campaign import pool
 from netdesign.cluster import executor_of
 from netdesign.files.adjustment import campaign_member, campaign_payload
 from netdesign.files.design_json import PlannedNetwork, find_network, read_networks
+from netdesign.files.image_folder import complete_image_folder
 from netdesign.files.store import read_json, write_json
 from netdesign.imageset import worker_pool
-from netdesign.imaging.photograph import RendererName
+from netdesign.imaging.photograph import RendererName, Shoot
 from netdesign.model.progress import Progress, silent
 from netdesign.model.task import Task
 from netdesign.proof import is_proved, photograph, prove_network
@@ -51,7 +52,10 @@ def render_network(
     task = open_run(run)
     network = find_network(run, number)
     with worker_pool(workers) as executor:
-        return len(photograph(task, network, out, 0, executor, progress, renderer))
+        count = len(photograph(task, network, out, 0, executor, progress, renderer))
+    title = f"{task.study.name}, network {number}: {count} synthetic images made by netdesign."
+    complete_image_folder(out, task.camera, task.scene.targets, title=title, bits=Shoot.bits)
+    return count
 
 
 def validate_run(

@@ -149,10 +149,20 @@ def test_a_recipe_becomes_an_image_set(tmp_path):
         "exposure.supersample = 2\nfaults.wrong_ids = 1\nfaults.clutter = 2\nfaults.glare = 1\n"
         "extras.depth = true\nextras.tag_mask = true\nextras.kalibr = true\nextras.opencv = true\n"
     )
+    (tmp_path / "full.toml").write_text(recipe.read_text())
     assert render_dataset(recipe, tmp_path / "out") == 1
     for name in ("README.txt", "targets.csv", "camchain.yaml", "aprilgrid.yaml", "camera-opencv.yaml",
                  "depth/0000.npy", "masks/0000.png", "images/0000.png", "truth.json"):  # fmt: skip
         assert (tmp_path / "out" / name).is_file()
+    guide = (tmp_path / "out" / "README.txt").read_text()
+    there = {path.name for path in (tmp_path / "out").iterdir()} - {"README.txt"}
+    assert {name for name in there if name in guide} == there
+    recipe.write_text(text + "camera.focal_px = [600, 600]\ncamera.principal_point_px = [199.5, 149.5]\n"
+                      "poses.images = 1\nexposure.supersample = 2\n")  # fmt: skip
+    render_dataset(recipe, tmp_path / "bare")
+    guide = (tmp_path / "bare" / "README.txt").read_text()
+    assert not [name for name in ("depth", "masks", "Kalibr", "OpenCV's", "faults") if name in guide]
+    recipe.write_text((tmp_path / "full.toml").read_text())
     plan = load_recipe(recipe)
     assert (plan.drawn[0].targets.ids[:25] != plan.scene.targets.ids).sum() == 2
     recipe.write_text(text + "poses.imagse = 1\n")

@@ -48,6 +48,7 @@ def kalibr_grid(targets: Targets) -> str | None:
         return None
     spacing = (float(steps.mean()) - targets.size_m) / targets.size_m
     return (
+        "# The tags have a black border of one cell; Kalibr's detector expects two unless blackTagBorder is set to 1.\n"
         "target_type: 'aprilgrid'\n"
         f"tagCols: {len(columns)}\n"
         f"tagRows: {len(rows)}\n"

@@ -27,6 +27,7 @@ from netdesign.files.store import write_bytes, write_json, write_text
 from netdesign.imaging.measure import Gates, TagMeasurement, measure
 from netdesign.imaging.photograph import Photographer, Shoot
 from netdesign.imaging.pictures import linear, png_bytes, read_picture
+from netdesign.imaging.render import check_width
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.camera import Camera
 from netdesign.model.network import Observations
@@ -77,9 +78,11 @@ def render_images(
         The n image paths.
 
     Raises:
-        InputError: ``out`` cannot be written, or holds pictures that are no image set of ours.
+        InputError: pictures too wide; ``out`` cannot be written, or holds pictures that are no image set of ours.
         EnvironmentProblem: the renderer's system libraries are missing.
     """
+    if shoot.renderer == "pyrender":
+        check_width(camera, shoot.supersample)
     _check_folder(out)
     visible = sightings(scene, camera, world_from_cam, limits).visible
     xy_px, _ = project(world_from_cam[:, None], scene.targets.points[None], camera.intrinsics)

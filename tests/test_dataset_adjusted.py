@@ -11,6 +11,7 @@ import pytest
 from netdesign.adjust import adjust_folder
 from netdesign.adjustment.nominal import misplaced_tags
 from netdesign.dataset import render_dataset
+from netdesign.errors import InputError
 from netdesign.files.store import read_json
 from netdesign.model.frames import pose, similarity, transform
 from tests.scenes import box_scene
@@ -77,3 +78,12 @@ def test_misplaced_tags_are_those_that_moved(wrong):
     np.testing.assert_array_equal(np.flatnonzero(misplaced), sorted(wrong))
     assert np.isnan(deviation[5])
     assert not misplaced_tags(points[:12], nominal[:12], used[:12])[1].any()  # too few to say
+
+
+def test_pictures_too_wide_for_opengl_are_refused_before_anything_is_written(tmp_path):
+    (tmp_path / "r.toml").write_text(
+        f'format = 1\nname = "r"\nstudy = "{STUDY.resolve()}"\nposes.images = 1\ncamera.width_px = 19000\n'
+    )
+    with pytest.raises(InputError, match="lower supersample or use --renderer reference"):
+        render_dataset(tmp_path / "r.toml", tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from netdesign.errors import EnvironmentProblem
+from netdesign.errors import EnvironmentProblem, InputError
 from netdesign.imaging.geometry import FACE_STEP_PX, TagQuad, divided, face_levels, part_triangles, tag_quads
 from netdesign.imaging.looks import Appearance
 from netdesign.imaging.optics import Picture, decimate, margin_px
@@ -50,11 +50,29 @@ def probe() -> str:
     return f"{gl.glGetString(gl.GL_RENDERER).decode()}, OpenGL {gl.glGetString(gl.GL_VERSION).decode()}"
 
 
+def check_width(camera: Camera, supersample: int) -> None:
+    """Refuse pictures that OpenGL cannot draw.
+
+    Raises:
+        InputError: with the way out.
+    """
+    if camera.width_px * supersample > MAX_SIDE:
+        raise InputError(
+            f"camera.width_px: OpenGL draws at most {MAX_SIDE} samples across, found {camera.width_px} px x "
+            f"supersample {supersample}; lower supersample or use --renderer reference"
+        )
+
+
 class Renderer:
     """Draws one scene with one camera."""
 
     def __init__(self, scene: Scene, camera: Camera, supersample: int = 4, appearance: Appearance | None = None):
-        """Prepare the scene; the OpenGL context is made at the first picture."""
+        """Prepare the scene; the OpenGL context is made at the first picture.
+
+        Raises:
+            InputError: the picture is too wide.
+        """
+        check_width(camera, supersample)
         self.scene, self.camera, self.supersample = scene, camera, supersample
         self.appearance = appearance or Appearance()
         self._textures: dict[int, Any] = {}
@@ -155,10 +173,6 @@ class _Drawing:
 
     def band(self, camera: Camera, factor: int, first_row: int, rows: int) -> NDArray[np.uint8]:
         """Return (rows·factor, width·factor) grey levels of a band that begins at pixel row ``first_row``."""
-        if camera.width_px * factor > MAX_SIDE:
-            raise EnvironmentProblem(
-                f"supersample: OpenGL draws at most {MAX_SIDE} samples across, found {camera.width_px} px x {factor}"
-            )
         fx, fy = camera.focal_px * factor
         cx, cy = (camera.principal_point_px + 0.5 - (0, first_row)) * factor
         node = self._scene.add(

@@ -9,6 +9,7 @@ from netdesign.imaging.optics import expose, noise_generator
 from netdesign.imaging.pictures import linear
 from netdesign.imaging.reference import ReferenceRenderer
 from netdesign.model.frames import inverse, look_at, sphere_directions
+from netdesign.model.scene import Part
 from netdesign.photogrammetry.collinearity import project
 from tests.scenes import CAMERA, plate_scene
 
@@ -104,3 +105,24 @@ def test_gamma_is_undone(picture):
     straight = measure(linear(bent, 2.2), CAM, "tag36h11", 0.02)
     plain = measure(picture, CAM, "tag36h11", 0.02)
     np.testing.assert_allclose([tag.corners_px for tag in straight], [tag.corners_px for tag in plain], atol=0.01)
+
+
+def test_large_tags_are_not_lost_to_the_outline_of_their_quiet_zone():
+    """A tag and its quiet zone are two squares one inside the other: OpenCV must not take the wrong one for both."""
+    rng = np.random.default_rng(0)
+    camera = replace(
+        CAM, width_px=320, height_px=240, focal_px=np.array([1200.0, 1200.0]),
+        principal_point_px=np.array([157.3, 121.8]), distortion=np.array([-0.1, 0.02, 0.0005, -0.0003]),
+    )  # fmt: skip
+    corners = 0.02 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    square = Part(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]]))
+    scene = replace(plate_scene(side=1, spacing=0.04, tag_size=0.02), part=square)
+    # The first view is lost when outlines as far apart as an eighth of their length are taken together.
+    views = [(7, np.array([0.08, -0.06, 0.24]), 0.3)]
+    for tag in rng.choice(587, 15, replace=False).tolist():
+        place = np.array([*rng.uniform(-0.2, 0.2, 2), 0.24]) * rng.uniform(0.9, 1.8)
+        views.append((tag, place, rng.uniform(-3, 3)))
+    for tag, place, roll in views:
+        one = replace(scene, targets=replace(scene.targets, ids=np.array([tag])))
+        light = ReferenceRenderer(one, camera).render(inverse(look_at(place, np.zeros(3), roll)))
+        assert [item.tag_id for item in detect(expose(light, camera, None), "tag36h11")] == [tag]

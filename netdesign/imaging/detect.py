@@ -20,6 +20,10 @@ from netdesign.model.frames import inverse, pose
 
 # OpenCV's default, 3 % of the longer side, hides tags below 31 px in a 4096 px picture.
 SMALLEST_PERIMETER_PX = 40.0
+# The outline of a tag's quiet zone is a square too, and OpenCV takes outlines together that are nearer than a share of
+# their length. Too little, and one of sixty large tags is lost to its own quiet zone, always the same one; too much,
+# and one of fifteen others is. No tag seen yet is lost to both, so each search has one of them.
+TOGETHER, APART = 0.125, 0.02
 DARK = 100.0  # of 255: below it a picture is stretched before the search
 
 
@@ -43,12 +47,12 @@ def detect(picture: NDArray[np.generic], family: str, ids: Collection[int] | Non
     """
     grey = _eight_bits(picture)
     sighted: list[Sighted] = []
-    for item in _recognised(grey, family, ids):
+    for item in _recognised(grey, family, ids, TOGETHER):
         _add(item, sighted)
     if ids is None or len({item.tag_id for item in sighted}) < len(ids):
         # Once more, enlarged: cells of about 2 px lose bits at the original size, and noise breaks other outlines.
         large = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-        for item in _recognised(np.asarray(large), family, ids):
+        for item in _recognised(np.asarray(large), family, ids, APART):
             # Pixel centres: the enlarged picture has its first sample at -0.25.
             _add(Sighted(tag_id=item.tag_id, corners_px=item.corners_px / 2 - 0.25), sighted)
     return sorted(sighted, key=lambda item: (item.tag_id, *item.corners_px.ravel().tolist()))
@@ -64,8 +68,8 @@ def _eight_bits(picture: NDArray[np.generic]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(table[np.asarray(picture)])
 
 
-def _recognised(grey: NDArray[np.generic], family: str, ids: Collection[int] | None) -> list[Sighted]:
-    corners, found, _ = _detector(family, max(grey.shape)).detectMarkers(grey)
+def _recognised(grey: NDArray[np.generic], family: str, ids: Collection[int] | None, distance: float) -> list[Sighted]:
+    corners, found, _ = _detector(family, max(grey.shape), distance).detectMarkers(grey)
     if found is None:
         return []
     return [
@@ -85,16 +89,14 @@ def _add(item: Sighted, sighted: list[Sighted]) -> None:
     sighted.append(item)
 
 
-def _detector(family: str, longer_side: int) -> "cv2.aruco.ArucoDetector":
+def _detector(family: str, longer_side: int, distance: float) -> "cv2.aruco.ArucoDetector":
     settings = cv2.aruco.DetectorParameters()
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     settings.cornerRefinementWinSize = 3
     settings.relativeCornerRefinmentWinSize = 0.3
     settings.minMarkerPerimeterRate = SMALLEST_PERIMETER_PX / longer_side
     settings.minCornerDistanceRate = 0.02
-    # The outline of the quiet zone is a square too; outlines nearer than this are taken together. At 0.02 one of sixty
-    # large tags, always the same ones, was lost to its own quiet zone.
-    settings.minMarkerDistanceRate = 0.125
+    settings.minMarkerDistanceRate = distance
     settings.errorCorrectionRate = 0.4
     return cv2.aruco.ArucoDetector(dictionary(family), settings)
 

@@ -187,8 +187,8 @@ def dataset(
     from netdesign.dataset import render_dataset
 
     with _progress() as progress:
-        count = render_dataset(recipe, output, workers=_workers(workers), renderer=renderer, progress=progress)
-    _print(f"{output}: {count} images, COLMAP model, truth.json")
+        made = render_dataset(recipe, output, workers=_workers(workers), renderer=renderer, progress=progress)
+    _print(f"{output}: {made.text}")
 
 
 @app.command("calibrate-noise")

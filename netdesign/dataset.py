@@ -1,10 +1,12 @@
 """The verb ``dataset``: a free-standing synthetic image set from a recipe."""
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from netdesign.errors import InputError
 from netdesign.files.calibrators import kalibr_camchain, kalibr_grid, opencv_camera
 from netdesign.files.image_folder import complete_image_folder
 from netdesign.files.recipe import ImageSetPlan, load_recipe
@@ -12,28 +14,71 @@ from netdesign.files.store import write_bytes, write_text
 from netdesign.imageset import image_name, render_images, worker_pool
 from netdesign.imaging.photograph import RendererName
 from netdesign.imaging.pictures import png_bytes
+from netdesign.imaging.plausible import enclosed, fold_radius_px, image_radius_px
 from netdesign.imaging.reference import ReferenceRenderer
 from netdesign.model.frames import inverse
 from netdesign.model.progress import Progress, silent
+from netdesign.photogrammetry.connectivity import listed
+from netdesign.photogrammetry.visibility import sightings
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetOutcome:
+    """How many images were written, and the names of those that show no tag by the study's visibility limits."""
+
+    images: int
+    blind: tuple[str, ...]
+
+    @property
+    def text(self) -> str:
+        """What was written, and in a second line what is to be known about it."""
+        written = f"{self.images} images, COLMAP model, truth.json"
+        if not self.blind:
+            return written
+        return (
+            f"{written}\nwarning      {len(self.blind)} of {self.images} image(s) show no tag within the study's "
+            f"[visibility]: {listed(self.blind)}"
+        )
 
 
 def render_dataset(
     recipe: Path, out: Path, *, workers: int = 0, renderer: RendererName = "pyrender", progress: Progress = silent
-) -> int:
-    """Write the free-standing image set of a recipe and return the number of images.
+) -> DatasetOutcome:
+    """Write the free-standing image set of a recipe.
 
     Raises:
         InputError: the recipe or what it points to is wrong.
         EnvironmentProblem: the renderer's system libraries are missing.
     """
     plan = load_recipe(recipe, renderer)
+    _check(plan, recipe)
     with worker_pool(workers) as executor:
         paths = render_images(
             plan.scene, plan.camera, plan.limits, plan.world_from_cam, out, plan.shoot,
             executor=executor, progress=progress, drawn=plan.drawn,
         )  # fmt: skip
     _write_extras(plan, out)
-    return len(paths)
+    visible = sightings(plan.scene, plan.camera, plan.world_from_cam, plan.limits).visible
+    blind = tuple(image_name(index) for index in np.flatnonzero(~visible.any(axis=1)).tolist())
+    return DatasetOutcome(images=len(paths), blind=blind)
+
+
+def _check(plan: ImageSetPlan, path: Path) -> None:
+    """Refuse what no camera can photograph.
+
+    Raises:
+        InputError: the image folds, or a camera stands inside the part.
+    """
+    fold, corner = fold_radius_px(plan.camera), image_radius_px(plan.camera)
+    if fold < corner:
+        raise InputError(
+            f"{path}: camera.distortion: expected an image that does not fold up to its corners, {corner:.0f} px from "
+            f"the principal point; found that no ray arrives farther than {fold:.0f} px out"
+        )
+    inside = enclosed(plan.scene.part, plan.world_from_cam[:, :3, 3])
+    if inside.any():
+        names = [image_name(index) for index in np.flatnonzero(inside).tolist()]
+        raise InputError(f"{path}: poses: expected cameras outside the part, found inside it: {listed(names)}")
 
 
 def _write_extras(plan: ImageSetPlan, out: Path) -> None:

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,9 @@ from netdesign.adjustment.nominal import misplaced_tags
 from netdesign.dataset import render_dataset
 from netdesign.errors import InputError
 from netdesign.files.store import read_json
+from netdesign.imaging.plausible import enclosed, fold_radius_px
 from netdesign.model.frames import pose, similarity, transform
-from tests.scenes import box_scene
+from tests.scenes import CAMERA, box_part, box_scene
 
 STUDY = Path(__file__).parents[1] / "datasets" / "studies" / "plate.toml"
 
@@ -87,3 +89,47 @@ def test_pictures_too_wide_for_opengl_are_refused_before_anything_is_written(tmp
     with pytest.raises(InputError, match="lower supersample or use --renderer reference"):
         render_dataset(tmp_path / "r.toml", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+IMPOSSIBLE = {
+    "fold": ("camera.distortion = [-3.0, 0, 0, 0]", "does not fold"),
+    "inside": ("poses.given = [[0, 0, -1.5, 0, 0, 0]]", "outside the part, found inside it: 0000.png"),
+}
+
+
+@pytest.mark.parametrize("case", IMPOSSIBLE)
+def test_what_no_camera_can_photograph_is_refused(case, tmp_path):
+    line, message = IMPOSSIBLE[case]
+    (tmp_path / "r.toml").write_text(f'format = 1\nname = "r"\nstudy = "{STUDY.resolve()}"\n{line}\n')
+    with pytest.raises(InputError, match=message):
+        render_dataset(tmp_path / "r.toml", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_images_that_show_no_tag_are_named(tmp_path):
+    (tmp_path / "r.toml").write_text(
+        f'format = 1\nname = "r"\nstudy = "{STUDY.resolve()}"\ncamera.width_px = 400\ncamera.height_px = 300\n'
+        "camera.principal_point_px = [199.5, 149.5]\ncamera.focal_px = [600, 600]\nexposure.supersample = 1\n"
+        "poses.given = [[0, 0, 500, 0, 0, 0], [0, 0, 500, 180, 0, 0]]\n"  # away from the plate, towards it
+    )
+    made = render_dataset(tmp_path / "r.toml", tmp_path / "out")
+    assert made.blind == ("0000.png",)
+    assert made.text.endswith("1 of 2 image(s) show no tag within the study's [visibility]: 0000.png")
+
+
+def test_the_fold_is_where_the_distorted_radius_turns_back():
+    radii = np.linspace(0, 2, 200001)
+    for k1, k2 in ((-3.0, 0.0), (-0.5, 0.02), (-0.4, -0.1)):
+        bent = radii * (1 + k1 * radii**2 + k2 * radii**4)
+        turn = np.flatnonzero(np.diff(bent) < 0)[0]
+        camera = replace(CAMERA, distortion=np.array([k1, k2, 0, 0]))
+        assert fold_radius_px(camera) == pytest.approx(3600 * bent[turn], rel=1e-6)
+    assert fold_radius_px(replace(CAMERA, distortion=np.array([-0.1, 0.03, 0, 0]))) == np.inf
+    assert fold_radius_px(CAMERA) == np.inf
+
+
+def test_a_closed_part_encloses_its_inside_only():
+    part = box_part(size=(0.2, 0.2, 0.2))
+    np.testing.assert_array_equal(enclosed(part, np.array([[0, 0, 0], [0.09, 0.0, 0.05], [0.11, 0, 0]])), [1, 1, 0])
+    opened = replace(part, faces=part.faces[2:])
+    assert not enclosed(opened, np.zeros((1, 3))).any()

@@ -150,7 +150,7 @@ def test_a_recipe_becomes_an_image_set(tmp_path):
         "extras.depth = true\nextras.tag_mask = true\nextras.kalibr = true\nextras.opencv = true\n"
     )
     (tmp_path / "full.toml").write_text(recipe.read_text())
-    assert render_dataset(recipe, tmp_path / "out") == 1
+    assert render_dataset(recipe, tmp_path / "out").images == 1
     for name in ("README.txt", "targets.csv", "camchain.yaml", "aprilgrid.yaml", "camera-opencv.yaml",
                  "depth/0000.npy", "masks/0000.png", "images/0000.png", "truth.json"):  # fmt: skip
         assert (tmp_path / "out" / name).is_file()

@@ -16,6 +16,7 @@ from netdesign.model.scene import Part, Targets
 UNIT_M = {"mm": 1e-3, "m": 1.0, "inch": 0.0254}
 TAG_COLUMNS = ("tag", "x_mm", "y_mm", "z_mm", "nx", "ny", "nz", "ux", "uy", "uz")
 TAG_COUNT = {"tag36h11": 587}
+PHASES = 12  # steps of a spacing by which a grid is moved to make tags fit
 CELLS_PER_TAG = 8  # the black square of 36h11 is 8 cells wide; one white cell around it is the quiet zone
 
 
@@ -107,7 +108,8 @@ def spread_targets(part: Part, family: str, size_m: float, spacing_m: float) -> 
     """Put tags on a square grid on every flat face of the part that has room for them.
 
     A flat face is a group of coplanar neighbouring triangles; a tag goes where the black square and its quiet zone of
-    one cell lie inside. Faces are taken from the largest to the smallest until the family has no more ids.
+    one cell lie inside the face. The grid is centred; on a part that has no room for a tag so, it is moved to where
+    most fit. Faces are taken from the largest to the smallest until the family has no more ids.
 
     Raises:
         InputError: no face has room for a tag, or the spacing is smaller than a tag with its quiet zone.
@@ -122,15 +124,13 @@ def spread_targets(part: Part, family: str, size_m: float, spacing_m: float) -> 
         np.array([face]) for face in np.setdiff1d(np.arange(len(mesh.faces)), np.concatenate([*mesh.facets, [-1]]))
     ]
     areas = np.array([mesh.area_faces[group].sum() for group in groups])
+    large = [index for index in np.argsort(-areas, kind="stable") if areas[index] >= outer**2]
     found: list[tuple[Floats, Floats, Floats]] = []
-    for index in np.argsort(-areas, kind="stable"):
-        if areas[index] < outer**2:
-            break
-        normal = np.asarray(mesh.face_normals[groups[index][0]])
-        found += [
-            (centre, normal, x_axis)
-            for centre, x_axis in _grid(part.triangles[groups[index]], normal, spacing_m, outer)
-        ]
+    for moved in (False, True):
+        for index in [] if found else large:
+            normal = np.asarray(mesh.face_normals[groups[index][0]])
+            places = _grid(part.triangles[groups[index]], normal, spacing_m, outer, moved)
+            found += [(centre, normal, x_axis) for centre, x_axis in places]
     found = found[: TAG_COUNT[family]]
     if not found:
         raise InputError(
@@ -143,29 +143,39 @@ def spread_targets(part: Part, family: str, size_m: float, spacing_m: float) -> 
     )
 
 
-def _grid(triangles: Floats, normal: Floats, spacing: float, outer: float) -> list[tuple[Floats, Floats]]:
-    """Return (centre, x axis) of the tags on one flat face (t, 3, 3), the grid centred on its bounding box."""
+def _grid(triangles: Floats, normal: Floats, spacing: float, outer: float, moved: bool) -> list[tuple[Floats, Floats]]:
+    """Return (centre, x axis) of the tags on one flat face (t, 3, 3).
+
+    The grid is centred on the bounding box of the face, or ``moved`` to where most tags fit.
+    """
     reference = np.array([0.0, 0, 1]) if abs(normal[2]) < 0.9 else np.array([0.0, 1, 0])
     x_axis = np.cross(reference, normal)
     x_axis = x_axis / np.linalg.norm(x_axis)
     y_axis = np.cross(normal, x_axis)
     flat = np.stack([triangles @ x_axis, triangles @ y_axis], axis=-1)
     low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
-    counts = np.floor((high - low - outer) / spacing + 1e-9).astype(int) + 1
-    steps = [
-        (low[axis] + high[axis]) / 2 + (np.arange(max(counts[axis], 0)) - (counts[axis] - 1) / 2) * spacing
-        for axis in (0, 1)
-    ]
     # Inside: a dense border of sample points, half a quiet cell apart, lies in the face; enough for convex notches.
     ticks = np.linspace(-outer / 2, outer / 2, 21)
     border = np.array([(x, y) for x in ticks for y in ticks])
     height = float((triangles[0] @ normal).mean())
-    return [
-        (x * x_axis + y * y_axis + height * normal, x_axis)
-        for y in steps[1]
-        for x in steps[0]
-        if _covered(border + np.array([x, y]), flat)
-    ]
+    middle, room = (low + high) / 2, high - low - outer
+    if (room < 0).any():
+        return []
+    if not moved:
+        counts = np.floor(room / spacing + 1e-9).astype(int) + 1
+        starts = [middle - (counts - 1) / 2 * spacing]
+    else:
+        starts = [low + outer / 2 + np.array([i, j]) / PHASES * spacing for j in range(PHASES) for i in range(PHASES)]
+    last = high - outer / 2
+    fitting = max((_fitting(start, last, spacing, border, flat) for start in starts), key=len)
+    return [(x * x_axis + y * y_axis + height * normal, x_axis) for x, y in fitting]
+
+
+def _fitting(first: Floats, last: Floats, spacing: float, border: Floats, flat: Floats) -> list[Floats]:
+    """Return the places (2,) of a grid from ``first`` to ``last``, row by row, whose tag lies in the face (t, 3, 2)."""
+    columns, rows = (np.floor((last - first) / spacing + 1e-9).astype(int) + 1).tolist()
+    places = [first + spacing * np.array([i, j]) for j in range(rows) for i in range(columns)]
+    return [place for place in places if _covered(border + place, flat)]
 
 
 def _covered(points: Floats, triangles: Floats) -> bool:

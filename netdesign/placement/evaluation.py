@@ -118,8 +118,8 @@ def loose_images(cells: Ints, sure: NDArray[np.uint64], reached: NDArray[np.uint
     similarity. Images that see nothing do not count. ``reached`` (words,): scratch.
     """
     reached[:] = np.uint64(0)
-    loose, before = 0, -1
-    while loose != before:
+    loose, before = len(cells), len(cells) + 1
+    while 0 < loose < before:
         before, loose = loose, 0
         empty = True
         for w in range(len(reached)):

@@ -82,6 +82,7 @@ def by_numpy(problem: Problem) -> Evaluate:
             tags = problem.visibility.sure_tags(problem.visibility.cell_of(viewpoints))
             few = np.maximum(tables.min_tags - tags.sum(axis=1), 0).sum() / tables.min_tags
             lacking = np.maximum(tables.min_rays - tags.sum(axis=0), 0).sum() + few
+            lacking = lacking or loose_by_numpy(tags)
             objectives[row, 2] = len(viewpoints)
             if lacking > 0:
                 violation[row] = 1.0 + lacking
@@ -94,6 +95,16 @@ def by_numpy(problem: Problem) -> Evaluate:
         return objectives, violation
 
     return evaluate
+
+
+def loose_by_numpy(tags: Bools) -> int:
+    """Return how many of the images, tags (k, g), hang together with the first by no chain of common tags."""
+    reached, joined = tags[0], np.zeros(len(tags), np.bool_)
+    while True:
+        before, joined = joined, (tags & reached).any(axis=1)
+        if (joined == before).all():
+            return int((~joined).sum())
+        reached = tags[joined].any(axis=0)
 
 
 def agreement(problem: Problem) -> None:

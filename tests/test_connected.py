@@ -12,8 +12,9 @@ from netdesign.model.scene import Targets
 from netdesign.photogrammetry.connectivity import loose_images
 from netdesign.placement import evaluation
 from netdesign.placement.finish import finish
+from netdesign.placement.infeasible import why_infeasible
 from netdesign.placement.problem import Problem
-from netdesign.search.engine import run
+from netdesign.search.engine import run, start
 from tests.scenes import box_scene, plate_scene, sphere
 from tests.test_placement import task_of
 
@@ -67,3 +68,15 @@ def test_a_part_in_two_halves_is_refused_with_the_reason():
     problem = Problem.build(task)
     with pytest.raises(InfeasibleError, match="share no object point with the others"):
         finish(problem, run(problem, "memetic", 20, 10, 1))
+
+
+def test_a_tag_that_no_candidate_sees_is_named_and_no_error(monkeypatch):
+    """As a robot's reach makes of it: the map of what is seen does not know the reach, the candidates do."""
+    problem = Problem.build(task_of(plate_scene(side=3), max_images=6, min_rays=2))
+    sees = Problem.sees
+    monkeypatch.setattr(Problem, "sees", lambda self, viewpoints: sees(self, viewpoints) & (np.arange(9) != 4))
+    _, genes = problem.seeds()
+    assert np.isfinite(genes).all()
+    state = start(problem, "memetic", 8, 1)
+    assert why_infeasible(problem, state).startswith("1 of 9 tags are seen by fewer than 2 of ")
+    assert "tags 4 (by 0)" in why_infeasible(problem, state)

@@ -2,8 +2,8 @@
 
 A network's violation is the sum of what is missing: rays per tag, tags per image, images that hang together with the
 others, stations out of reach, points whose rays are nearly parallel, and the part of the tour beyond the longest
-admissible one. Infeasible networks skip what
-follows the first failing stage. What is reported is computed anew, exactly, in ``finish``.
+admissible one. Infeasible networks skip what follows the first failing stage. What is reported is computed anew,
+exactly, in ``finish``.
 """
 
 import math
@@ -114,8 +114,9 @@ def missing_sightings(cells: Ints, tables: SphereTables, at_least: NDArray[np.ui
 def loose_images(cells: Ints, sure: NDArray[np.uint64], reached: NDArray[np.uint64]) -> int:
     """Return how many images, in ``cells`` (k,), share no tag with the first one, not even by way of others.
 
-    A bundle adjustment cannot tell where such images are. One tag in common is enough: its four corners fix a
-    similarity. Images that see nothing do not count. ``reached`` (words,): scratch.
+    A bundle adjustment cannot tell where such images are. A tag in common is necessary, not sufficient (one image
+    alone does not carry the scale of its group): the exact check of ``finish`` decides. Images that see nothing do not
+    count. ``reached`` (words,): scratch.
     """
     reached[:] = np.uint64(0)
     loose, before = len(cells), len(cells) + 1

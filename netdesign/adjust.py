@@ -29,8 +29,11 @@ from netdesign.photo_set import is_photo_set, read_photo_set
 from netdesign.photogrammetry.connectivity import listed
 from netdesign.photogrammetry.observation_equations import parameter_matrix
 from netdesign.reporting.adjustment import adjustment_text
+from netdesign.run_folder import belongs_to_validation
 
 USUAL_ITERATIONS = 8
+# In a network's folder of a run adjustment.json is what validation.json speaks of: report and campaign read it.
+BESIDE_VALIDATION = "adjustment-own.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +68,8 @@ def adjust_folder(
         datum_points: names of the points that carry the inner constraints, None or none for all.
         control, scale_bars, poses: files, instead of control.csv, scalebars.csv and poses.csv in the folder.
         refine: interior parameters to estimate.  robust: find and reject gross errors.
-        out: folder for adjustment.json, None for ``folder``.
+        out: folder for adjustment.json, None for ``folder``. In a network's folder of a run, whose adjustment.json
+            belongs to its validation, the file is called adjustment-own.json.
 
     Raises:
         InputError: what was read is wrong.  InfeasibleError: the network does not determine what is asked for.
@@ -75,6 +79,7 @@ def adjust_folder(
     place = out or folder
     if place.exists() and not place.is_dir():
         raise InputError(f"{place}: expected a folder to write adjustment.json into, found a file")
+    path = place / (BESIDE_VALIDATION if belongs_to_validation(place) else "adjustment.json")
     progress("read", 0, 1)
     found, blind, notes, on_nominal = _read(folder, sigma_px, tuple(refine or ()), progress)
     progress("read", 1, 1)
@@ -116,7 +121,6 @@ def adjust_folder(
     if on_nominal:
         adjustment = replace(adjustment, warnings=(*adjustment.warnings, *_misplaced(adjustment, found)))
     record = plain(adjustment_payload(adjustment, found.image_names, found.point_names))
-    path = place / "adjustment.json"
     try:
         write_json(path, "adjustment", record)
     except OSError as error:

@@ -16,7 +16,7 @@ import numpy as np
 from netdesign.errors import InputError
 from netdesign.files.store import write_json
 from netdesign.files.study import load_task
-from netdesign.imageset import camera_record, each, worker_pool
+from netdesign.imageset import each, worker_pool
 from netdesign.imaging.measure import measure
 from netdesign.imaging.photograph import Photographer, Shoot
 from netdesign.model.arrays import Floats
@@ -26,6 +26,7 @@ from netdesign.model.progress import Progress, silent
 from netdesign.model.scene import CORNERS_PER_TAG, Part, Scene, Targets
 from netdesign.photogrammetry.collinearity import project
 from netdesign.photogrammetry.precision import corner_rms
+from netdesign.truth import camera_record
 
 SIDES_PX = (20.0, 30.0, 50.0, 85.0, 140.0)
 INCIDENCES_DEG = (0.0, 35.0, 60.0)

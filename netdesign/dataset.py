@@ -11,7 +11,7 @@ from netdesign.files.calibrators import kalibr_camchain, kalibr_grid, opencv_cam
 from netdesign.files.image_folder import complete_image_folder
 from netdesign.files.recipe import ImageSetPlan, load_recipe
 from netdesign.files.store import write_bytes, write_text
-from netdesign.imageset import image_name, render_images, worker_pool
+from netdesign.imageset import render_images, worker_pool
 from netdesign.imaging.photograph import RendererName
 from netdesign.imaging.pictures import png_bytes
 from netdesign.imaging.plausible import enclosed, fold_radius_px, image_radius_px
@@ -20,6 +20,10 @@ from netdesign.model.frames import inverse
 from netdesign.model.progress import Progress, silent
 from netdesign.photogrammetry.connectivity import listed
 from netdesign.photogrammetry.visibility import sightings
+from netdesign.truth import image_name
+
+# What a recipe may ask for: an earlier recipe's would be taken for files of this one.
+EXTRAS = ("depth/*.npy", "masks/*.png", "camchain.yaml", "aprilgrid.yaml", "camera-opencv.yaml", "faults.csv")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,12 +88,16 @@ def _check(plan: ImageSetPlan, path: Path) -> None:
 def _write_extras(plan: ImageSetPlan, out: Path) -> None:
     """Write what the recipe asks for beside the images, and a README that says what everything is."""
     extras, targets = plan.recipe.extras, plan.scene.targets
+    for stale in (name for pattern in EXTRAS for name in out.glob(pattern)):
+        stale.unlink()
+    for folder in (out / "depth", out / "masks"):
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
     if extras.kalibr:
         write_text(out / "camchain.yaml", kalibr_camchain(plan.camera))
         grid = kalibr_grid(targets)
         if grid is not None:
             write_text(out / "aprilgrid.yaml", grid)
-    (out / "faults.csv").unlink(missing_ok=True)
     if plan.recipe.faults.wrong_ids:
         write_text(out / "faults.csv", _wrong_ids(plan))
     if extras.opencv:

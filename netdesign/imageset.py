@@ -21,14 +21,13 @@ from typing import Any
 import numpy as np
 
 from netdesign.errors import InputError
-from netdesign.files.colmap import ColmapModel, point3d_id, write_model
 from netdesign.files.noise import read_corner_noise
-from netdesign.files.store import write_bytes, write_json, write_text
+from netdesign.files.store import write_bytes
 from netdesign.imaging.measure import Gates, TagMeasurement, measure
 from netdesign.imaging.photograph import Photographer, Shoot
 from netdesign.imaging.pictures import linear, png_bytes, read_picture
 from netdesign.imaging.render import check_width
-from netdesign.model.arrays import Bools, Floats
+from netdesign.model.arrays import Floats
 from netdesign.model.camera import Camera
 from netdesign.model.network import Observations
 from netdesign.model.progress import Progress, silent
@@ -36,8 +35,7 @@ from netdesign.model.scene import CORNERS_PER_TAG, Scene, Targets
 from netdesign.model.task import VisibilityLimits
 from netdesign.photogrammetry.collinearity import project
 from netdesign.photogrammetry.visibility import sightings
-
-MM = 1e-3
+from netdesign.truth import image_name, write_truth
 
 
 @contextlib.contextmanager
@@ -54,11 +52,6 @@ def worker_pool(workers: int) -> Iterator[Executor | None]:
         yield pool
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def image_name(index: int) -> str:
-    """Return the file name of picture ``index``."""
-    return f"{index:04d}.png"
 
 
 def render_images(
@@ -87,9 +80,9 @@ def render_images(
     visible = sightings(scene, camera, world_from_cam, limits).visible
     xy_px, _ = project(world_from_cam[:, None], scene.targets.points[None], camera.intrinsics)
     paths = [out / "images" / image_name(index) for index in range(len(world_from_cam))]
-    _write_truth(scene, camera, world_from_cam, visible, xy_px, out, shoot, study_sha256)
-    missing = [index for index, path in enumerate(paths) if not path.is_file()]
     shown = drawn or [scene] * len(paths)
+    write_truth(scene, camera, world_from_cam, visible, xy_px, out, shoot, shown, study_sha256)
+    missing = [index for index, path in enumerate(paths) if not path.is_file()]
     sessions = {id(item): pickle.dumps((item, camera, shoot)) for item in shown}
     jobs = [(sessions[id(shown[index])], index, world_from_cam[index], paths[index]) for index in missing]
     for _ in each(_render_one, jobs, executor, "render", progress):
@@ -171,70 +164,6 @@ def observations_of(
         covariance=np.reshape(blocks, (-1, 2, 2)),
     )  # fmt: skip
     return observations, covariances, rejected
-
-
-def _write_truth(
-    scene: Scene, camera: Camera, world_from_cam: Floats, visible: Bools, xy_px: Floats, out: Path, shoot: Shoot,
-    study_sha256: str | None,
-) -> None:  # fmt: skip
-    """Write what the pictures are; pictures of another truth are removed first."""
-    names = [image_name(index) for index in range(len(world_from_cam))]
-    ids = scene.targets.point_ids
-    poses = world_from_cam.copy()
-    poses[:, :3, 3] /= MM
-    truth = {
-        "camera": camera_record(camera),
-        "renderer": shoot.renderer,
-        "seed": shoot.seed,
-        "supersample": shoot.supersample,
-        "bits": shoot.bits,
-        "noise": shoot.noise,
-        "tags": {"family": scene.targets.family, "size_mm": scene.targets.size_m / MM},
-        "points": [{"id": name, "xyz_mm": xyz / MM} for name, xyz in zip(ids, scene.targets.points, strict=True)],
-        "images": [
-            {
-                "name": name,
-                "world_from_cam_mm": poses[index],
-                "points": [ids[j] for j in np.flatnonzero(visible[index])],
-                "xy_px": xy_px[index, visible[index]],
-            }
-            for index, name in enumerate(names)
-        ],
-    }
-    before = (out / "truth.json").read_bytes() if (out / "truth.json").is_file() else b""
-    write_json(out / "truth.json", "truth", truth, study_sha256)
-    if before != (out / "truth.json").read_bytes():
-        for stale in (out / "images").glob("*.png"):
-            stale.unlink()
-    image, point = np.nonzero(visible)
-    lines = [
-        f"{names[i]},{ids[j].replace('.', ',')},{xy_px[i, j, 0]:.6f},{xy_px[i, j, 1]:.6f}"
-        for i, j in zip(image, point, strict=True)
-    ]
-    write_text(out / "corners.csv", "\n".join(["image,tag,corner,x_px,y_px", *lines]) + "\n")
-    write_model(
-        out,
-        ColmapModel(
-            cameras=(camera,), camera_ids=(1,), camera_of_image=np.zeros(len(names), np.int64), names=tuple(names),
-            world_from_cam=world_from_cam,
-            point_ids=tuple(point3d_id(int(tag), k) for tag in scene.targets.ids for k in range(CORNERS_PER_TAG)),
-            points=scene.targets.points, image=image, point=point, xy_px=xy_px[image, point],
-        ),
-    )  # fmt: skip
-
-
-def camera_record(camera: Camera) -> dict[str, Any]:
-    """Return a camera with the keys of a study's [camera] table."""
-    return {
-        "width_px": camera.width_px,
-        "height_px": camera.height_px,
-        "focal_px": camera.focal_px,
-        "principal_point_px": camera.principal_point_px,
-        "distortion": camera.distortion,
-        "blur_px": camera.blur_px,
-        "full_well_e": camera.full_well_e,
-        "read_noise_e": camera.read_noise_e,
-    }
 
 
 @lru_cache(maxsize=1)

@@ -23,7 +23,7 @@ from netdesign.errors import EnvironmentProblem, InputError, NetdesignError
 from netdesign.files.adjustment import absolute_payload, adjustment_payload, length_payload, validation_payload
 from netdesign.files.design_json import PlannedNetwork
 from netdesign.files.store import read_json, write_json, write_text
-from netdesign.imageset import image_name, measure_images, observations_of, render_images
+from netdesign.imageset import measure_images, observations_of, render_images
 from netdesign.imaging.measure import Gates, TagMeasurement
 from netdesign.imaging.photograph import RendererName, Shoot
 from netdesign.model.adjustment import Adjustment
@@ -38,6 +38,7 @@ from netdesign.photogrammetry.limited_error import limited_covariance
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_error import total_covariance
 from netdesign.photogrammetry.visibility import sightings
+from netdesign.truth import image_name
 
 # The detector's own limits; which tags are wanted is for the plan to say, up to 70 deg and a robot's error.
 GATES = Gates(max_incidence=float(np.radians(71.0)))

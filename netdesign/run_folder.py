@@ -22,6 +22,14 @@ def run_folder(resolved: ResolvedStudy, output: Path | None) -> Path:
     return run
 
 
+def belongs_to_validation(folder: Path) -> bool:
+    """Whether ``folder`` is where ``validate`` keeps a network's results, to be read and renewed by it alone."""
+    if (folder / "validation.json").is_file():
+        return True
+    above = folder.resolve().parents
+    return any(parent.name == "networks" and (parent.parent / "study.toml").is_file() for parent in above[:2])
+
+
 def open_run(run: Path) -> Task:
     """Return the task of an existing run directory.
 

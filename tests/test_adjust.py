@@ -90,6 +90,22 @@ def test_free_network_writes_the_contract(tmp_path):
     assert again.path.read_bytes() == (tmp_path / "adjustment.json").read_bytes()
 
 
+@pytest.mark.parametrize("mark", ["run/networks/0003/validation.json", "run/study.toml"])
+@pytest.mark.parametrize("named", [False, True])
+def test_the_adjustment_of_a_validation_is_not_touched(tmp_path, mark, named):
+    poses, points, observations = _case()
+    folder = tmp_path / "run" / "networks" / "0003"
+    _write(folder, *disturbed(poses, points), observations)
+    (tmp_path / mark).write_text("")
+    (folder / "adjustment.json").write_text("the validation's")
+    outcome = adjust_folder(folder, sigma_px=0.1, out=folder if named else None)
+    assert (folder / "adjustment.json").read_text() == "the validation's"
+    assert outcome.path == folder / "adjustment-own.json"
+    assert outcome.path.is_file()
+    assert "adjustment-own.json" in outcome.text
+    assert adjust_folder(folder, sigma_px=0.1, out=tmp_path / "b").path == tmp_path / "b" / "adjustment.json"
+
+
 @pytest.mark.parametrize("datum", ["free", "scale", "control", "fixed"])
 def test_units_names_and_order_do_not_matter(tmp_path, datum):
     poses, points, observations = _case(seed=1)

@@ -15,6 +15,8 @@ from netdesign.files.noise import read_corner_noise
 from netdesign.files.recipe import load_recipe
 from netdesign.files.store import read_json
 from netdesign.imageset import measure_images, observations_of, render_images, worker_pool
+from netdesign.imaging.looks import Appearance
+from netdesign.imaging.optics import Shading
 from netdesign.imaging.photograph import Photographer, Shoot
 from netdesign.imaging.pictures import png_bytes, read_picture
 from netdesign.imaging.reference import ReferenceRenderer
@@ -93,6 +95,45 @@ def test_pictures_are_the_same_whatever_the_workers_and_are_not_made_twice(image
     assert paths[1].read_bytes() == b"kept"
     render_images(SCENE, CAM, EASY, POSES, tmp_path, Shoot(seed=6, supersample=2))
     assert paths[1].read_bytes() != b"kept"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"motion_m": (0.0, 1e-3, 0.0)}, {"lens_samples": 8}, {"glare": 1}, {"shading": Shading(vignetting=4.0)},
+        {"appearance": Appearance(face=0.5)}, {"noise": False}, {"renderer": "pyrender"}, {"bits": 16},
+        {"camera": replace(CAM, f_number=4.0)}, {"camera": replace(CAM, focus_m=0.5)},
+        {"camera": replace(CAM, read_noise_e=9.0)}, {"drawn": "other ids"}, {"scene": "other part"},
+    ],
+    ids=lambda change: next(iter(change)),
+)  # fmt: skip
+def test_pictures_of_other_settings_are_made_again(tmp_path, monkeypatch, change):
+    made = []
+
+    def note(job):
+        made.append(job[1])
+        job[3].write_bytes(b"picture")
+
+    monkeypatch.setattr("netdesign.imageset._render_one", note)
+    camera = replace(CAM, pixel_m=8e-6, f_number=8.0, focus_m=0.6)
+    scene, shoot, drawn = SCENE, Shoot(renderer="reference"), None
+    for _ in range(2):
+        render_images(scene, camera, EASY, POSES[:2], tmp_path, shoot)
+    assert made == [0, 1]
+    if "drawn" in change:
+        ids = scene.targets.ids.copy()
+        ids[[0, 1]] = ids[[1, 0]]
+        drawn = [scene, replace(scene, targets=replace(scene.targets, ids=ids))]
+    elif "scene" in change:  # a shape behind the same tags
+        part = replace(scene.part, vertices=scene.part.vertices * np.array([1.0, 1.0, 1.1]))
+        scene = replace(scene, part=part)
+    elif "camera" in change:
+        camera = replace(change["camera"], **({} if change["camera"].pixel_m else {"pixel_m": 8e-6}))
+    else:
+        shoot = replace(shoot, **change)
+    for _ in range(2):
+        render_images(scene, camera, EASY, POSES[:2], tmp_path, shoot, drawn=drawn)
+    assert made == [0, 1, 0, 1]
 
 
 def test_the_reference_renderer_makes_the_set_too(tmp_path):

@@ -77,7 +77,7 @@ def _with_robot(task: Task, network: PlannedNetwork, format: Format, out: Path) 
         solids = cell_geometry(joint_map.arm, task.scene.part, network.joints[0])
         write_bytes(out, cell_glb(solids, network.world_from_cam, view))
         return
-    program = program_of(joint_map, network.joints)
+    program = program_of(joint_map, network.joints, network.vias)
     if format == "json":
         record = {**program_record(program, task), "stations": _stations(network)}
         write_json(out, "program", record, task.sha256)

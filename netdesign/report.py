@@ -7,12 +7,15 @@ import numpy as np
 
 from netdesign.choose import choose, poses_of, read_design
 from netdesign.errors import InfeasibleError
+from netdesign.files.design_json import vias_of
 from netdesign.files.store import read_json, write_bytes, write_text
 from netdesign.files.study_text import study_toml
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
-from netdesign.motion.robot import load_chain
+from netdesign.motion.joint_tour import chain_law
+from netdesign.motion.plan import leg_lengths
+from netdesign.motion.robot import Chain, load_chain
 from netdesign.photogrammetry.limited_error import limited_covariance
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_error import DATUM
@@ -27,7 +30,7 @@ from netdesign.reporting.record import NetworkRecord, RunRecord
 from netdesign.reporting.statics import Raster, thumbnail
 from netdesign.run_folder import open_run
 
-UM = 1e-6
+MM, UM = 1e-3, 1e-6
 TRIANGLES = 20000  # of the part as it is drawn
 THUMBNAILS = 4  # of a network; the recommended one shows every station
 REACH_SAMPLES = 4000
@@ -95,7 +98,8 @@ def read_run(run: Path) -> RunRecord:
     task, design = open_run(run), read_design(run)
     sight = Sight(task.scene, task.camera, task.limits)
     recommended, reason = _recommended(run)
-    networks = tuple(_network(run, task, sight, entry, recommended) for entry in design["networks"])
+    chain = None if task.cell is None else load_chain(task.cell)
+    networks = tuple(_network(run, task, sight, entry, recommended, chain) for entry in design["networks"])
     return RunRecord(
         task=task,
         design=design,
@@ -103,12 +107,14 @@ def read_run(run: Path) -> RunRecord:
         campaign=_optional(run / "validation.json", "validation"),
         knee=recommended,
         reason=reason,
-        arm=None if task.cell is None else Arm.of(task.cell, load_chain(task.cell)),
+        arm=None if task.cell is None or chain is None else Arm.of(task.cell, chain),
         recomputed=max(_difference(network) for network in networks),
     )
 
 
-def _network(run: Path, task: Task, sight: Sight, entry: dict[str, Any], recommended: int) -> NetworkRecord:
+def _network(
+    run: Path, task: Task, sight: Sight, entry: dict[str, Any], recommended: int, chain: Chain | None
+) -> NetworkRecord:
     poses = poses_of(entry)
     seen = sight.look(poses)
     total = network_total_error(task, poses, seen.visible)
@@ -119,6 +125,8 @@ def _network(run: Path, task: Task, sight: Sight, entry: dict[str, Any], recomme
         visible_tags=seen.visible_tags,
         limited=total.limited,
         total=total.covariance,
+        vias=vias_of(entry),
+        legs=_legs(task, entry, poses, chain),
         without=_without(task, poses, seen.visible),
         datum=DATUM,
         determined=total.determined,
@@ -130,6 +138,16 @@ def _network(run: Path, task: Task, sight: Sight, entry: dict[str, Any], recomme
         thumbnails=_thumbnails(folder, everything=entry["id"] == recommended),
         adjustment=_optional(folder / "adjustment.json", "adjustment"),
     )
+
+
+def _legs(task: Task, entry: dict[str, Any], poses: Floats, chain: Chain | None) -> Floats:
+    """Return (n - 1,) lengths of the legs in the unit of f2: mm, weighted rad, or s of driving."""
+    joints = entry.get("joints_rad")
+    if task.study.motion == "workspace" or joints is None or task.cell is None or chain is None:
+        straight: Floats = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / MM
+        return straight
+    law = chain_law(chain, np.array(task.cell.joint_weights or np.ones(len(chain))))
+    return leg_lengths(np.array(joints), vias_of(entry), law, task.study.motion == "time")
 
 
 def _without(task: Task, poses: Floats, visible: Bools) -> Floats:

@@ -1,6 +1,7 @@
 """The verb design: recomputed without netdesign, byte-identical whatever the threads, clear refusals."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -9,6 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from netdesign.motion.robot import load_chain
+from netdesign.motion.timing import leg_time
+from netdesign.report import read_run
+from netdesign.reporting.articles import article
+from netdesign.reporting.mesh import PartMesh
+from netdesign.reporting.payload import payload
 from tests.recompute import Recomputed, nearest_neighbour_3opt, path_length
 
 DATASETS = Path(__file__).parents[1] / "datasets"
@@ -73,6 +80,35 @@ def test_objectives_recomputed_in_plain_numpy(run):
         assert path_length(distance, range(len(nodes))) == pytest.approx(network["objectives"][1], rel=1e-9)
         best = min(nearest_neighbour_3opt(distance, start) for start in range(len(nodes)))
         assert network["objectives"][1] <= best * (1 + 1e-9)
+
+
+def test_the_report_counts_legs_as_the_tour_does(run, tmp_path):
+    """Over via points too: put into the design of a copy, as an obstacle would."""
+    for network in read_run(run).networks:
+        assert network.legs.sum() == pytest.approx(network.tour, rel=1e-9)
+    content = json.loads((run / "design.json").read_text())
+    first = content["networks"][0]
+    if first["joints_rad"] is None:
+        assert first["vias_rad"] is None
+        return
+    assert [len(points) for points in first["vias_rad"]] == [0] * (len(first["joints_rad"]) - 1)
+    start, end = np.array(first["joints_rad"][1:3])
+    over = start + np.array([0.3, 0, 0, 0, 0, -0.4])
+    first["vias_rad"][1] = [over.tolist()]
+    shutil.copytree(run, tmp_path / "run")
+    (tmp_path / "run" / "design.json").write_text(json.dumps(content))
+    record = read_run(tmp_path / "run")
+    network = record.networks[0]
+    assert network.legs[1] == pytest.approx(0.5 + np.linalg.norm(end - over), rel=1e-12)
+    assert [row[9] for row in article(record, network, b"")["tour"]["rows"]][2].endswith(" over 1 via")
+    mesh = PartMesh.of(record.task.scene.part, 100)
+    assert payload(record, mesh)["networks"][0]["vias"] == {"1": pytest.approx(over, abs=1e-5)}
+    study = tmp_path / "run" / "study.toml"
+    study.write_text(study.read_text().replace('motion = "joint"', 'motion = "time"'))
+    chain = load_chain(record.task.cell)
+    timed = read_run(tmp_path / "run").networks[0]
+    expected = sum(leg_time(*pair, chain.speed, chain.acceleration) for pair in ((start, over), (over, end)))
+    assert timed.legs[1] == pytest.approx(expected, rel=1e-12)
 
 
 def test_no_network_of_the_front_is_dominated(run):

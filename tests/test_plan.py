@@ -15,7 +15,7 @@ from netdesign.motion.joint_tour import law_of
 from netdesign.motion.kinematics import base_from_flange
 from netdesign.motion.legs import Legs
 from netdesign.motion.options import exact_options
-from netdesign.motion.plan import plan_on, tour_length
+from netdesign.motion.plan import leg_lengths, plan_on
 from netdesign.motion.program import program_of, sampled
 from netdesign.motion.timing import leg_law, leg_time
 from netdesign.motion.tour import nearest_neighbour_3opt
@@ -48,7 +48,7 @@ def test_a_plan_can_be_driven(mount, roll, motion):
             np.testing.assert_allclose(plan.world_from_cam - look_at(positions, np.zeros(3), roll), 0, atol=1e-9)
         assert plan.tour.length == pytest.approx(driven(plan, here, motion), rel=1e-12)
         for number, (start, end) in enumerate(itertools.pairwise(joints)):
-            way = np.concatenate([start[None], plan.vias.get(number, np.zeros((0, 6))), end[None]])
+            way = np.concatenate([start[None], plan.tour.vias.get(number, np.zeros((0, 6))), end[None]])
             for a, b in itertools.pairwise(way):
                 assert not here.meshes.leg_contact(a, b, 0.05)
 
@@ -57,7 +57,7 @@ def driven(plan, here, motion):
     """The length by the definition, leg by leg."""
     total = 0.0
     for number, (start, end) in enumerate(itertools.pairwise(plan.tour.joints)):
-        way = np.concatenate([start[None], plan.vias.get(number, np.zeros((0, 6))), end[None]])
+        way = np.concatenate([start[None], plan.tour.vias.get(number, np.zeros((0, 6))), end[None]])
         for a, b in itertools.pairwise(way):
             total += (
                 np.linalg.norm(b - a)
@@ -169,8 +169,8 @@ def test_length_over_via_points():
     joints[1, 0] = 2.0
     via = np.array([[1.0, 1.0, 0, 0, 0, 0]])
     law = law_of(arm())
-    assert tour_length(joints, {0: via}, law, False) == pytest.approx(2 * np.sqrt(2))
-    assert tour_length(joints, {}, law, False) == pytest.approx(2.0)
+    assert leg_lengths(joints, {0: via}, law, False).sum() == pytest.approx(2 * np.sqrt(2))
+    assert leg_lengths(joints, {}, law, False).sum() == pytest.approx(2.0)
 
 
 def test_a_seven_joint_arm_is_planned():

@@ -40,6 +40,19 @@ def controller_flange(q):
     return pose
 
 
+def test_a_program_goes_over_the_via_points_of_the_design_unless_they_touch_something():
+    of_map = joint_map()
+    start = np.array([0.89, -1.67, 2.60, -0.32, 1.44, 1.65])
+    end = np.array([-0.97, -0.55, 1.58, -2.70, 1.38, -0.48])
+    found = program_of(of_map, np.array([start, end]))
+    assert found.station.tolist() == [0, *[-1] * (len(found.waypoints) - 2), 1]
+    planned = np.insert(found.waypoints[1:-1], 1, found.waypoints[1:3].mean(axis=0), axis=0)
+    program = program_of(of_map, np.array([start, end]), {0: planned})
+    np.testing.assert_array_equal(program.waypoints, [start, *planned, end])
+    touching = program_of(of_map, np.array([start, end]), {0: 0.5 * (start + end)[None]})
+    np.testing.assert_array_equal(touching.waypoints, found.waypoints)
+
+
 def test_urscript_poses_against_the_controllers_own_kinematics(planned):
     _, plan, program = planned
     text = urscript(program, 3)

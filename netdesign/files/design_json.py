@@ -1,6 +1,6 @@
 """RUN/design.json: the front, written from a Design and read back as plain networks."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,14 @@ class PlannedNetwork:
 
     Attributes:
         viewpoints: (n, 2) rad.  world_from_cam: (n, 4, 4) m.  joints: (n, r) rad or None.
+        vias: via points (k, r) rad of the legs that have them; leg i leaves station i.
     """
 
     id: int
     viewpoints: Floats
     world_from_cam: Floats
     joints: Floats | None
+    vias: dict[int, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "viewpoints", frozen("viewpoints", self.viewpoints, ("n", 2)))
@@ -83,8 +85,15 @@ def read_networks(run: Path) -> dict[int, PlannedNetwork]:
             viewpoints=np.radians(entry["viewpoints_deg"]),
             world_from_cam=world_from_cam,
             joints=None if entry["joints_rad"] is None else np.array(entry["joints_rad"]),
+            vias=vias_of(entry),
         )
     return networks
+
+
+def vias_of(entry: dict[str, Any]) -> dict[int, Floats]:
+    """Return the via points (k, r) rad of a network's entry by number of the leg; earlier versions wrote none."""
+    legs = entry.get("vias_rad") or []
+    return {leg: np.array(points, dtype=np.float64) for leg, points in enumerate(legs) if points}
 
 
 def read_unmet(run: Path) -> str | None:
@@ -120,6 +129,9 @@ def _network(number: int, network: DesignedNetwork, scales: tuple[float, float])
         "radius_mm": None if network.radius is None else network.radius / MM,
         "world_from_cam_mm": world_from_cam_mm,
         "joints_rad": network.tour.joints,
+        "vias_rad": None
+        if network.tour.joints is None
+        else [network.tour.vias.get(leg, np.zeros((0, 0))) for leg in range(network.f3 - 1)],
         "rms_sigma_um": _rms_um(network.precision),
         "max_sigma_um": float(network.precision.sigma.max()) / UM,
         "datum": network.precision.datum,

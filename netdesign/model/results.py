@@ -1,6 +1,6 @@
 """What a search hands over: precision, tours and the front."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -48,14 +48,16 @@ class Tour:
 
     Attributes:
         order: (n,) station indices in visiting order.
-        length: sum of the legs: m (workspace), weighted rad (joint), s (time, dwell included).
+        length: sum of the legs: m (workspace), weighted rad (joint), s (time, dwell included), over the via points.
         joints: (n, r) rad in visiting order, or None without a robot.
+        vias: via points (k, r) rad of the legs that need them, by number of the leg; leg i leaves station i.
     """
 
     order: Ints
     length: float
     space: Space
     joints: Floats | None = None
+    vias: dict[int, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "order", frozen("order", self.order, ("n",), np.int64))

@@ -24,6 +24,7 @@ from netdesign.model.arrays import Floats
 from netdesign.model.compiled import FAST, entry, part
 from netdesign.motion.cell import ArmCell
 from netdesign.motion.joint_lookup import LANES, MapArrays, options_of
+from netdesign.motion.robot import Chain
 from netdesign.motion.tour import _improve
 
 NO_TURN = 1e9
@@ -38,9 +39,14 @@ def law_of(arm: ArmCell) -> Floats:
 
     Joints that an arm does not have cost nothing.
     """
-    placed, count = arm.placed, len(arm.chain)
+    return chain_law(arm.placed, arm.weights)
+
+
+def chain_law(placed: Chain, weights: Floats) -> Floats:
+    """Return the same of a chain and lambda (r,)."""
+    count = len(placed)
     law = np.zeros((4, MOST_JOINTS))
-    law[:, :count] = arm.weights, 1.0 / placed.speed, 1.0 / placed.acceleration, 2.0 * np.pi * placed.wraps
+    law[:, :count] = weights, 1.0 / placed.speed, 1.0 / placed.acceleration, 2.0 * np.pi * placed.wraps
     law[3, law[3] == 0.0] = NO_TURN
     return law
 

@@ -10,7 +10,7 @@
 """
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -45,7 +45,6 @@ class Plan:
     Attributes:
         tour: order into the viewpoints given, joints (n, r) rad, length; None when stations are refused.
         world_from_cam: (n, 4, 4) m, from the joints.  viewpoints: (n, 2) rad.
-        vias: via points (k, r) of the legs that need them, by number of the leg; their way is in the tour's length.
         warnings: what was done about collisions.
         refused: index into the viewpoints given, and reason.
     """
@@ -53,7 +52,6 @@ class Plan:
     tour: Tour | None
     world_from_cam: Floats
     viewpoints: Floats
-    vias: dict[int, Floats] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     refused: tuple[tuple[int, str], ...] = ()
 
@@ -125,32 +123,34 @@ def plan_on(joint_map: JointMap, viewpoints: Floats, motion: Literal["joint", "t
         more += from_home
     if refused:
         return Plan(tour=None, world_from_cam=np.zeros((0, 4, 4)), viewpoints=np.zeros((0, 2)), refused=refused)
-    length = tour_length(joints, vias, law_of(arm), timed)
+    length = float(leg_lengths(joints, vias, law_of(arm), timed).sum())
     if timed:
         length += joint_map.arm.cell.dwell * len(joints)
     return Plan(
-        tour=Tour(order=order, length=length, space=motion, joints=joints),
+        tour=Tour(order=order, length=length, space=motion, joints=joints, vias=vias),
         world_from_cam=forward(arm.body.placements, arm.body.last_from_cam, joints),
         viewpoints=viewpoints[order],
-        vias=vias,
         warnings=(*notes, *more),
     )
 
 
-def tour_length(joints: Floats, vias: dict[int, Floats], law: Floats, timed: bool) -> float:
-    """Return the cost of driving joints (n, r) in order over the via points, without dwell."""
-    way = [joints[:1]]
+def leg_lengths(joints: Floats, vias: dict[int, Floats], law: Floats, timed: bool) -> Floats:
+    """Return the cost (n - 1,) of driving joints (n, r) in order over the via points, leg by leg, without dwell."""
+    r = joints.shape[1]
+    lengths = np.zeros(len(joints) - 1)
     for leg in range(len(joints) - 1):
-        way += [vias[leg]] if leg in vias else []
-        way.append(joints[leg + 1 : leg + 2])
-    points = np.concatenate(way)
-    change, r = np.abs(np.diff(points, axis=0)), joints.shape[1]
-    if not timed:
-        return float(np.sqrt(((law[0, :r] * change) ** 2).sum(axis=1)).sum())
-    longest, hardest = (change * law[1, :r]).max(axis=1), (change * law[2, :r]).max(axis=1)
-    cruise = longest**2 >= hardest
-    ramp = hardest / np.where(longest > 0, longest, 1.0)
-    return float(np.where(cruise, longest + ramp, 2.0 * np.sqrt(hardest)).sum())
+        change = np.abs(
+            np.diff(
+                np.concatenate([joints[leg : leg + 1], vias.get(leg, joints[:0]), joints[leg + 1 : leg + 2]]), axis=0
+            )
+        )
+        if not timed:
+            lengths[leg] = np.sqrt(((law[0, :r] * change) ** 2).sum(axis=1)).sum()
+            continue
+        longest, hardest = (change * law[1, :r]).max(axis=1), (change * law[2, :r]).max(axis=1)
+        ramp = hardest / np.where(longest > 0, longest, 1.0)
+        lengths[leg] = np.where(longest**2 >= hardest, longest + ramp, 2.0 * np.sqrt(hardest)).sum()
+    return lengths
 
 
 def _plain(law: Floats) -> Floats:

@@ -45,25 +45,30 @@ class Program:
         return np.array([leg_law(a, b, chain.speed, chain.acceleration).duration for a, b in pairs])
 
 
-def program_of(joint_map: JointMap, joints: Floats) -> Program:
+def program_of(joint_map: JointMap, joints: Floats, planned: dict[int, Floats] | None = None) -> Program:
     """Return the program over joints (n, r) in visiting order, from home and back; legs that collide get via points.
+
+    Args:
+        planned: via points of the design by number of the leg; they are what its tour was measured over.
 
     Raises:
         InfeasibleError: a leg for which no free way is found.
     """
     arm = joint_map.arm
-    legs = Legs(joint_map)
+    legs, planned = Legs(joint_map), planned or {}
     home = [] if arm.cell.home is None else [(-1, np.array(arm.cell.home))]
     stops = [*home, *enumerate(joints), *home]
     waypoints, station = [stops[0][1]], [stops[0][0]]
-    for leg, ((_, start), (number, end)) in enumerate(itertools.pairwise(stops), start=1):
-        contact = legs.contact(start, end)
+    for leg, ((left, start), (number, end)) in enumerate(itertools.pairwise(stops), start=1):
+        vias = planned.get(left, np.zeros((0, len(arm.chain)))) if 0 <= left < number else np.zeros((0, len(arm.chain)))
+        contact = _contact(legs, [start, *vias, end])
         if contact:
-            vias = legs.detour(start, end)
-            if vias is None:
+            detour = legs.detour(start, end)
+            if detour is None:
                 raise InfeasibleError(f"leg {leg}: no free way: {contact}")
-            waypoints += list(vias)
-            station += [-1] * len(vias)
+            vias = detour
+        waypoints += list(vias)
+        station += [-1] * len(vias)
         waypoints.append(end)
         station.append(number)
     path = np.array(waypoints)
@@ -76,6 +81,11 @@ def program_of(joint_map: JointMap, joints: Floats) -> Program:
         base_from_cam=base_from_cam,
         controller_from_cam=arm.chain.controller_from_base @ base_from_cam,
     )
+
+
+def _contact(legs: Legs, way: list[Floats]) -> str:
+    """Return what is touched first on straight lines from point to point, "" when they are free."""
+    return next((contact for pair in itertools.pairwise(way) if (contact := legs.contact(*pair))), "")
 
 
 def camera_poses(arm: ArmCell, joints: Floats) -> Floats:

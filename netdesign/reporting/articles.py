@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from netdesign.model.task import Task
 from netdesign.reporting import charts, proof, words
 from netdesign.reporting.record import UM, NetworkRecord, RunRecord, rms_um
 from netdesign.reporting.statics import exaggeration
@@ -60,11 +59,10 @@ def _tour(record: RunRecord, network: NetworkRecord) -> Values:
     """Return the run sheet: stations in visiting order, the leg that leads there, and what the loss of one costs."""
     joints = network.planned.get("joints_rad")
     degrees = None if joints is None else np.degrees(np.array(joints))
-    legs, unit = _legs(record.task, network)
     least = record.task.limits.min_rays
     rays = network.visible_tags.sum(axis=0)
     columns = ["station", "azimuth α", "elevation β", "x mm", "y mm", "z mm", "points seen", "rms σ without it"]
-    columns += [f"points left with < {least} rays", f"leg [{unit}]"]
+    columns += [f"points left with < {least} rays", f"leg [{record.tour_unit}]"]
     columns += [] if degrees is None else [f"q{index}°" for index in range(1, degrees.shape[1] + 1)]
     rows = []
     for index, (alpha, beta) in enumerate(network.planned["viewpoints_deg"]):
@@ -73,17 +71,16 @@ def _tour(record: RunRecord, network: NetworkRecord) -> Values:
         position = network.world_from_cam[index, :3, 3] * 1e3
         row = [str(index + 1), f"{alpha:.1f}°", f"{beta:.1f}°", *(f"{value:.1f}" for value in position)]
         row += [str(4 * int(seen.sum())), f"{100 * change:+.0f} %" if np.isfinite(change) else "undetermined"]
-        row += [str(4 * int((seen & (rays <= least)).sum())), "" if index == 0 else f"{legs[index - 1]:.3g}"]
+        row += [str(4 * int((seen & (rays <= least)).sum())), _leg(network, index)]
         row += [] if degrees is None else [f"{value:.1f}" for value in degrees[index]]
         rows.append(row)
     return {"columns": columns, "rows": rows}
 
 
-def _legs(task: Task, network: NetworkRecord) -> tuple[list[float], str]:
-    """Return (n - 1 leg lengths, unit): weighted joint space for the joint objective, else millimetres."""
-    joints = network.planned.get("joints_rad")
-    if task.study.motion == "joint" and joints is not None:
-        robot = task.study.robot
-        weights = np.ones(len(joints[0])) if robot is None or robot.joint_weights is None else robot.joint_weights
-        return np.linalg.norm(np.diff(np.array(joints), axis=0) * weights, axis=1).tolist(), "rad"
-    return (np.linalg.norm(np.diff(network.world_from_cam[:, :3, 3], axis=0), axis=1) * 1e3).tolist(), "mm"
+def _leg(network: NetworkRecord, station: int) -> str:
+    """Return the length of the leg to a station, and over how many via points it goes."""
+    if station == 0:
+        return ""
+    length = f"{network.legs[station - 1]:.3g}"
+    vias = network.vias.get(station - 1)
+    return length if vias is None else f"{length} over {len(vias)} via"

@@ -102,6 +102,7 @@ def _network(record: RunRecord, network: NetworkRecord, color: str) -> dict[str,
         "limited": _blocks(network.limited),
         "total_cov": _blocks(network.total),
         "joints": None if (joints := network.planned.get("joints_rad")) is None else decimals(np.array(joints), 5),
+        "vias": {str(leg): decimals(points, 5) for leg, points in network.vias.items()},
         "error": _errors(network),
         "proof": scatter(network),
     }

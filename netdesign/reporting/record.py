@@ -22,6 +22,8 @@ class NetworkRecord:
         world_from_cam: (n, 4, 4) m, in visiting order.
         visible_tags: (n, g) which image sees which tag, from exact rays.
         limited, total: (m, 3, 3) m², recomputed for the report from the poses; inf where undetermined.
+        vias: via points (k, r) rad of the legs that have them, by number of the leg.
+        legs: (n - 1,) lengths of the legs over their via points, in the unit of the tour, without the dwell.
         without: (n,) rms sigma in m, limited, if one image were lost; inf when a point is then undetermined.
         datum: of ``total``.  determined: the rank test of the total propagation.  diagnosis: what it complains about.
         validation, adjustment: contents of the network's files; None when they do not exist.
@@ -34,6 +36,8 @@ class NetworkRecord:
     visible_tags: Bools
     limited: Floats
     total: Floats
+    vias: dict[int, Floats]
+    legs: Floats
     without: Floats
     datum: str
     determined: bool

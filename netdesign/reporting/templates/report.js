@@ -276,8 +276,17 @@ function robotCell(network, plot) {
   let start = 0;
   for (const mesh of data.arm.links) { for (let t = 0; t < mesh.f.length; t += 3) { i.push(start + mesh.f[t]); j.push(start + mesh.f[t + 1]); k.push(start + mesh.f[t + 2]); } start += mesh.v.length / 3; }
   const joint = station => network.joints.slice(count * station, count * (station + 1));
+  /* Where the arm is on its way to the next station: straight in joint space from via point to via point, the share counted in joint distance. */
+  const way = from => {
+    const stops = [joint(from)], vias = network.vias[from] || [];
+    for (let at = 0; at < vias.length; at += count) stops.push(vias.slice(at, at + count));
+    return [...stops, joint(Math.min(from + 1, network.images - 1))];
+  };
   const at = position => {
-    const from = Math.floor(position), to = Math.min(from + 1, network.images - 1), share = position - from, a = joint(from), b = joint(to);
+    const from = Math.floor(position), stops = way(from), gaps = stops.slice(1).map((stop, leg) => Math.hypot(...stop.map((q, axis) => q - stops[leg][axis])));
+    let left = (position - from) * gaps.reduce((sum, gap) => sum + gap, 0), leg = 0;
+    while (leg < gaps.length - 1 && left > gaps[leg]) left -= gaps[leg++];
+    const share = gaps[leg] > 0 ? left / gaps[leg] : 0, a = stops[leg], b = stops[leg + 1];
     const poses = linkPoses(a.map((value, axis) => value + share * (b[axis] - value))), camera = times(poses[count], data.arm.camera);
     const seen = { x: [], y: [], z: [] }, put = p => { seen.x.push(p ? p[0] : null); seen.y.push(p ? p[1] : null); seen.z.push(p ? p[2] : null); }, depth = .9 * data.radius;
     const apex = carry(camera, 0, 0, 0), base = [0, 1, 2, 3].map(corner => carry(camera, data.frustum[2 * corner] * depth, data.frustum[2 * corner + 1] * depth, depth));

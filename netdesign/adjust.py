@@ -15,12 +15,13 @@ import numpy as np
 from netdesign.adjustment.estimate import estimate
 from netdesign.adjustment.nominal import misplaced_tags
 from netdesign.adjustment.problem import BundleProblem
-from netdesign.errors import InputError
+from netdesign.errors import InfeasibleError, InputError
 from netdesign.files.adjustment import adjustment_payload
 from netdesign.files.colmap import MODEL_FILES
 from netdesign.files.datum_tables import read_control, read_pose_priors, read_scale_bars
 from netdesign.files.observations import ObservationSet, read_observation_set
 from netdesign.files.store import plain, write_json
+from netdesign.imaging.plausible import fold_radius_px
 from netdesign.model.adjustment import Adjustment, Datum
 from netdesign.model.arrays import Bools
 from netdesign.model.progress import Progress, silent
@@ -115,9 +116,13 @@ def adjust_folder(
     def iterated(iteration: int, cost: float) -> None:
         progress("adjust", iteration - 1, max(USUAL_ITERATIONS, iteration), f"sum of squares {cost:.6g}")
 
-    adjustment = estimate(problem, robust=robust, sigma_known=found.sigma_known, progress=iterated)
+    beyond = _beyond_fold(found)
+    try:
+        adjustment = estimate(problem, robust=robust, sigma_known=found.sigma_known, progress=iterated)
+    except InfeasibleError as error:
+        raise InfeasibleError("; ".join([str(error), *beyond])) from None
     progress("adjust", USUAL_ITERATIONS, USUAL_ITERATIONS)
-    adjustment = replace(adjustment, warnings=(*notes, *_notes(problem, found), *adjustment.warnings))
+    adjustment = replace(adjustment, warnings=(*notes, *beyond, *_notes(problem, found), *adjustment.warnings))
     if on_nominal:
         adjustment = replace(adjustment, warnings=(*adjustment.warnings, *_misplaced(adjustment, found)))
     record = plain(adjustment_payload(adjustment, found.image_names, found.point_names))
@@ -175,6 +180,22 @@ def _mask(names: Sequence[str] | None, point_names: Sequence[str]) -> Bools | No
     if unknown:
         raise InputError(f"datum-points: expected names of object points, found {unknown[0]!r}")
     return np.isin(np.array(point_names), np.array(names))
+
+
+def _beyond_fold(found: ObservationSet) -> list[str]:
+    """Return that image points lie where the given distortion carries no ray, in one line or none."""
+    camera = found.camera_of_image[found.observations.image]
+    reach = np.array([fold_radius_px(row) for row in found.intrinsics])[camera]
+    radius = np.linalg.norm(found.observations.xy_px - found.intrinsics[camera, 2:4], axis=1)
+    beyond = radius > reach
+    if not beyond.any():
+        return []
+    images = [found.image_names[index] for index in np.unique(found.observations.image[beyond]).tolist()]
+    return [
+        f"{int(beyond.sum())} image point(s) lie up to {radius[beyond].max():.0f} px from the principal point, but the "
+        f"distortion k1, k2 of the camera carries no ray beyond {reach[beyond].min():.0f} px: it is not that of these "
+        f"images ({listed(images)})"
+    ]
 
 
 def _misplaced(adjustment: Adjustment, found: ObservationSet) -> list[str]:

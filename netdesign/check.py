@@ -8,6 +8,7 @@ import numpy as np
 
 from netdesign.errors import InfeasibleError
 from netdesign.files.study import load_task
+from netdesign.imaging.plausible import fold_radius_px, image_radius_px
 from netdesign.model.progress import Progress, silent
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
@@ -66,6 +67,8 @@ def _record(task: Task, seen: Coverage, reach: dict[str, float] | None, problems
         "tags": len(targets.ids),
         "points": len(targets.points),
         "left_out": list(task.left_out),
+        "fold_px": fold_radius_px(task.camera.intrinsics),
+        "corner_px": image_radius_px(task.camera),
         "depth_of_field_mm": [near * 1e3, far * 1e3],
         "sightings": seen.refusals,
         "seen_share": {str(tag): float(share) for tag, share in zip(seen.tag_ids, seen.share, strict=True)},
@@ -96,6 +99,11 @@ def _text(record: dict[str, Any]) -> str:
     near, far = record["depth_of_field_mm"]
     if np.isfinite(far) or near > 0:
         lines.append(f"sharp      {near:.0f} mm to {far:.0f} mm along the optical axis")
+    if record["fold_px"] < record["corner_px"]:
+        lines.append(
+            f"lens       the distortion folds the image over {record['fold_px']:.0f} px from the principal point, its"
+            f" corners are {record['corner_px']:.0f} px away: nothing counts as seen beyond"
+        )
     total = sum(record["sightings"].values())
     counts = "  ".join(f"{reason} {count}" for reason, count in record["sightings"].items() if count)
     lines.append(f"sightings  {total} tested over the sphere: {counts}")

@@ -73,7 +73,7 @@ def _check(plan: ImageSetPlan, path: Path) -> None:
     Raises:
         InputError: the image folds, or a camera stands inside the part.
     """
-    fold, corner = fold_radius_px(plan.camera), image_radius_px(plan.camera)
+    fold, corner = fold_radius_px(plan.camera.intrinsics), image_radius_px(plan.camera)
     if fold < corner:
         raise InputError(
             f"{path}: camera.distortion: expected an image that does not fold up to its corners, {corner:.0f} px from "

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -289,3 +290,13 @@ def test_control_point_that_is_nowhere_seen(tmp_path):
         adjust_folder(tmp_path, datum="control")
     shutil.copy(tmp_path / "control.csv", tmp_path / "other.csv")
     assert adjust_folder(tmp_path, datum="free").record["points"][5]["sigma_mm"] == [None] * 3
+
+
+def test_a_lens_that_folds_the_image_below_its_image_points_is_named(tmp_path):
+    poses, points, observations = _case()
+    camera = replace(camera_of(), distortion=np.array([-12.0, 0.0, 0.0, 0.0]))
+    _write(tmp_path, poses, points, observations, cameras=(camera,))
+    with pytest.raises(InfeasibleError, match=r"image point\(s\) lie up to .* carries no ray beyond"):
+        adjust_folder(tmp_path, sigma_px=0.1)
+    _write(tmp_path, poses, points, observations)
+    assert not any("no ray" in warning for warning in adjust_folder(tmp_path, sigma_px=0.1).record["warnings"])

@@ -103,3 +103,9 @@ def test_pose_from_a_tag_is_the_camera_that_saw_it():
         assert error_px < 1e-4
         np.testing.assert_allclose(transform(world_from_tag, tag_from_cam[:3, 3]), POSE[:3, 3], atol=1e-5)
         np.testing.assert_allclose((world_from_tag @ tag_from_cam)[:3, :3], POSE[:3, :3], atol=1e-5)
+
+
+def test_a_camera_at_its_target_looks_straight_down():
+    """A box of stations may contain the point that all look at."""
+    poses = look_at(np.array([[0.1, 0.2, 0.3], [0.1, 0.2, 0.4]]), np.array([0.1, 0.2, 0.3]))
+    np.testing.assert_array_equal(poses[0, :3, :3], poses[1, :3, :3])

@@ -123,9 +123,9 @@ def test_the_fold_is_where_the_distorted_radius_turns_back():
         bent = radii * (1 + k1 * radii**2 + k2 * radii**4)
         turn = np.flatnonzero(np.diff(bent) < 0)[0]
         camera = replace(CAMERA, distortion=np.array([k1, k2, 0, 0]))
-        assert fold_radius_px(camera) == pytest.approx(3600 * bent[turn], rel=1e-6)
-    assert fold_radius_px(replace(CAMERA, distortion=np.array([-0.1, 0.03, 0, 0]))) == np.inf
-    assert fold_radius_px(CAMERA) == np.inf
+        assert fold_radius_px(camera.intrinsics) == pytest.approx(3600 * bent[turn], rel=1e-6)
+    assert fold_radius_px(replace(CAMERA, distortion=np.array([-0.1, 0.03, 0, 0])).intrinsics) == np.inf
+    assert fold_radius_px(CAMERA.intrinsics) == np.inf
 
 
 def test_a_closed_part_encloses_its_inside_only():

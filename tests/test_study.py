@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from netdesign.check import check_study
 from netdesign.errors import InfeasibleError, InputError
 from netdesign.files.study import load_task, resolve, write_resolved
 
@@ -155,3 +156,12 @@ def test_tags_that_the_sphere_hardly_sees_can_be_left_out(study):
     np.testing.assert_array_equal(task.scene.targets.points, every.scene.targets.points[np.repeat(~below, 4)])
     with pytest.raises(InfeasibleError, match=r"min_seen_share: none of the \d+ tags is seen from 90.0% of the sphere"):
         load_task(study("spacing_mm = 45", "spacing_mm = 45\nmin_seen_share = 0.9"))
+
+
+def test_check_says_where_the_lens_folds_the_image(study):
+    """r (1 + k1 r²) has its largest value 2/3 sqrt(-1/(3 k1)) at r² = -1/(3 k1)."""
+    assert "lens  " not in check_study(study()).text
+    path = study("[camera]", "[camera]\ndistortion = [-4, 0, 0, 0]")
+    found, focal = check_study(path), load_task(path).camera.focal_px.min()
+    assert found.record["fold_px"] == pytest.approx(focal * 2 / 3 * np.sqrt(1 / 12), rel=1e-12)
+    assert f"folds the image over {found.record['fold_px']:.0f} px" in found.text

@@ -9,18 +9,21 @@ from netdesign.model.scene import Part
 ENCLOSED = 0.99  # of the full sphere; less inside an open shell, where a camera may well stand
 
 
-def fold_radius_px(camera: Camera) -> float:
+def fold_radius_px(intrinsics: Floats) -> float:
     """Return how far from the principal point the radial distortion can carry an image point before it turns back, px.
 
     The first stationary point of r (1 + k1 r² + k2 r⁴); infinite if there is none.
+
+    Args:
+        intrinsics: (8,) fx, fy, cx, cy, k1, k2, p1, p2.
     """
-    k1, k2 = (float(value) for value in camera.distortion[:2])
+    k1, k2 = (float(value) for value in intrinsics[4:6])
     roots = np.roots([5 * k2, 3 * k1, 1.0] if k2 else [3 * k1, 1.0] if k1 else [])
     squares = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 0]
     if not squares:
         return float("inf")
     square = min(squares)
-    return float(np.sqrt(square) * (1 + k1 * square + k2 * square**2) * camera.focal_px.min())
+    return float(np.sqrt(square) * (1 + k1 * square + k2 * square**2) * intrinsics[:2].min())
 
 
 def image_radius_px(camera: Camera) -> float:

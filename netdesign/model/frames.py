@@ -80,10 +80,11 @@ def look_at(position: Floats, target: Floats, roll: Floats | float = 0.0) -> Flo
 
     Roll 0 is the top view (x along world x) carried to the viewing direction by the smallest rotation
     (parallel transport): smooth everywhere but straight from below, where "up" is not. A positive roll (rad,
-    scalar or (…,)) turns the camera about its own z axis, from x towards y.
+    scalar or (…,)) turns the camera about its own z axis, from x towards y. A camera at its target looks straight down.
     """
     outward = np.asarray(position, dtype=np.float64) - target
-    outward = outward / np.linalg.norm(outward, axis=-1, keepdims=True)
+    distance = np.linalg.norm(outward, axis=-1, keepdims=True)
+    outward = np.where(distance > 0.0, outward / np.where(distance > 0.0, distance, 1.0), [0.0, 0.0, 1.0])
     ux, uy, uz = outward[..., 0], outward[..., 1], outward[..., 2]
     # Columns of the smallest rotation that takes +z to `outward`; 1/(1+uz) is guarded at the nadir.
     scale = 1.0 / np.maximum(1.0 + uz, 1e-12)

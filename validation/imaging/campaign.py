@@ -2,6 +2,7 @@
 
     python validation/imaging/campaign.py FOLDER [--workers N]     design (where needed) and validate, then the table
     python validation/imaging/campaign.py FOLDER --table           the table from what FOLDER holds
+    python validation/imaging/campaign.py FOLDER --part plate --networks 2     a sample: renews no file
 
 Studies of datasets/, those of few networks realised twice. FOLDER/NAME are run directories; what is done there is not
 done again. Writes campaign.json and the table of README.md. From an empty folder it takes about an hour on two cores.
@@ -19,6 +20,7 @@ import tomli_w
 from netdesign.adjustment.campaign import pool
 from netdesign.design import design_study
 from netdesign.files.adjustment import campaign_member, campaign_payload
+from netdesign.files.design_json import read_networks
 from netdesign.files.packages import PACKAGE_SCHEME
 from netdesign.files.store import plain
 from netdesign.validate import validate_run
@@ -103,18 +105,26 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--table", action="store_true", help="only renew the table")
+    parser.add_argument("--part", choices=REPEATS, action="append", help="this part only; repeat for more")
+    parser.add_argument("--networks", type=int, help="validate no more than so many networks of each part")
     asked = parser.parse_args()
     every, results = [], {}
-    for name in REPEATS:
+    for name in asked.part or REPEATS:
         if not asked.table:
             run = run_of(name, asked.folder)
             print(f"{name}: {run}", file=sys.stderr)
-            validate_run(run, None, workers=asked.workers, dask=None, progress=told)
+            chosen = None if asked.networks is None else sorted(read_networks(run))[: asked.networks]
+            validate_run(run, chosen, workers=asked.workers, dask=None, progress=told)
         records = records_of(asked.folder / name)
         if records:
             results[name] = summary(records)
             every += records
+    if not every:
+        sys.exit(f"{asked.folder}: expected validated networks, found none")
     results["all"] = summary(every)
+    if asked.part or asked.networks is not None:
+        print(table(results))
+        return
     (HERE / "campaign.json").write_text(json.dumps(plain(results), indent=1, sort_keys=True) + "\n", encoding="utf-8")
     readme = HERE / "README.md"
     head, rest = readme.read_text(encoding="utf-8").split(BEGIN)

@@ -232,9 +232,13 @@ def write_project(folder, project, points2d=True, csv=False, covariances=True, l
             lines.append(",".join([project.names[i], str(project.ids[j]), *map(number, values)]))
         put("observations.csv", lines)
     if project.control is not None:
-        lines = ["point,x_mm,y_mm,z_mm,sigma_mm"]
+        by_axis = np.ndim(project.control[2]) == 2
+        lines = ["point,x_mm,y_mm,z_mm," + ("sx_mm,sy_mm,sz_mm" if by_axis else "sigma_mm")]
         for j, xyz, sigma in zip(*project.control, strict=True):
-            lines.append(",".join([str(project.ids[j]), *map(number, xyz * 1e3), number(sigma * 1e3)]))
+            values = np.r_[xyz * 1e3, np.atleast_1d(sigma) * 1e3]
+            if by_axis:  # what is not known stays empty
+                values[np.isinf(np.r_[sigma, sigma])] = np.nan
+            lines.append(",".join([str(project.ids[j]), *("" if np.isnan(v) else number(v) for v in values)]))
         put("control.csv", lines)
     if project.bars is not None:
         lines = ["a,b,length_mm,sigma_mm"]
@@ -288,7 +292,7 @@ def dense_sigmas(project, record, datum, refine=(), datum_points=None, priors=No
         extra.append(block)
     if datum in ("control", "fixed") and project.control is not None:
         for j, _, sigma in zip(*project.control, strict=True):
-            if sigma == 0 or datum == "fixed":
+            if np.all(sigma == 0) or datum == "fixed":
                 fixed[j] = True
                 continue
             block = np.zeros((3, design.shape[1]))

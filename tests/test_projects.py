@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from netdesign.adjust import adjust_folder
 from netdesign.errors import InfeasibleError, InputError
+from netdesign.files.datum_tables import read_control
 from netdesign.model.frames import exp_rotation
 from netdesign.photogrammetry.datum import s_transformation
 from tests.projects import (
@@ -82,6 +83,46 @@ def test_control_points_whose_approximations_are_wrong(tmp_path, wrong):
         start = replace(start, points=points)
     found = _adjusted(tmp_path / "start", project, start, sigma_px=0.3, datum="control")
     assert np.abs(_points(project, found) - _points(project, good)).max() < 1e-6
+
+
+def test_control_with_a_sigma_per_axis_and_points_known_in_plan_or_height_only(tmp_path):
+    """Against the dense reference; the same sigma on every axis is the single sigma; what is measured is counted."""
+    project = aerial(6, 80, control=6)
+    point, xyz, sigma = project.control
+    alike = _adjusted(tmp_path / "one", project, sigma_px=0.3, datum="control")
+    each = replace(project, control=(point, xyz, np.repeat(sigma[:, None], 3, axis=1)))
+    assert _adjusted(tmp_path / "each", each, sigma_px=0.3, datum="control") == alike
+    levels = sigma[:, None] * np.array([1.0, 0.5, 3.0])
+    levels[0] = 0.0
+    levels[1, :2] = np.inf
+    levels[2, 2] = levels[3, 2] = np.inf
+    mixed = replace(project, control=(point, xyz, levels))
+    record = _adjusted(tmp_path / "mixed", mixed, sigma_px=0.3, datum="control")
+    assert record["datum"] == f"control: 1 error-free and {len(point) - 1} weighted control points"
+    assert record["n_observations"] == 2 * len(project.image) + 3 * (len(point) - 1) - 4
+    assert max(disagreement(mixed, record, "control")) < 1e-9
+    with pytest.raises(InputError, match="datum fixed: expected control points known along all axes"):
+        _adjusted(tmp_path / "fixed", mixed, sigma_px=0.3, datum="fixed")
+    plan = levels.copy()
+    plan[:, 2], plan[1], plan[0] = np.inf, np.inf, 0.1
+    plan[1, 0] = 0.1
+    plan[0, 2] = np.inf
+    with pytest.raises(InfeasibleError, match=r"control point\(s\) leave [0-9] of 7"):
+        _adjusted(tmp_path / "plan", replace(project, control=(point, xyz, plan)), sigma_px=0.3, datum="control")
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("3,1,2,3,0,1,1", "sigma 0 .error-free. on all axes or on none"), ("3,1,2,3,,,", "a sigma for at least one"),
+        ("3,1,2,3,1,-1,1", "sy_mm: expected 0"), ("3,1,,3,1,1,1", "y_mm: expected a finite"),
+        ("3,1,2,3,1,x,1", "sy_mm: expected a finite"),
+    ],
+)  # fmt: skip
+def test_wrong_sigmas_of_control_points(tmp_path, line, says):
+    (tmp_path / "control.csv").write_text(f"point,x_mm,y_mm,z_mm,sx_mm,sy_mm,sz_mm\n{line}\n")
+    with pytest.raises(InputError, match=says):
+        read_control(tmp_path / "control.csv", ["3"])
 
 
 def test_two_kinds_of_control_and_two_rays(tmp_path):

@@ -156,8 +156,8 @@ def test_every_datum_equals_the_dense_bordered_solution(kind, refine):
         extra.append(_bar_rows(result.points, bars, first, design.shape[1]))
     fixed = np.zeros(0, dtype=int)
     if "control" in options:
-        fixed = some[control.sigma == 0]
-        for j, s in zip(some[control.sigma > 0], control.sigma[control.sigma > 0], strict=True):
+        fixed = some[control.exact]
+        for j, s in zip(some[~control.exact], control.sigma[~control.exact], strict=True):
             rows = np.zeros((3, design.shape[1]))
             rows[range(3), range(first + 3 * j, first + 3 * j + 3)] = 1 / s
             extra.append(rows)

@@ -197,7 +197,7 @@ def _measured(problem: BundleProblem, layout: Layout) -> int:
     """Return the number of measured values: image coordinates, weighted control coordinates, lengths, priors."""
     control, bars, priors = problem.active_control, problem.active_bars, problem.active_priors
     count = 2 * len(problem.observations)
-    count += 0 if control is None else 3 * int((control.sigma > 0).sum())
+    count += 0 if control is None else int(((control.sigma > 0) & np.isfinite(control.sigma)).sum())
     count += 0 if bars is None else len(bars.a)
     return count + (0 if priors is None else 3 * sum(int((weight > 0).sum()) for weight in priors.weights[1:]))
 
@@ -222,7 +222,7 @@ def _datum_text(problem: BundleProblem, mask: Bools, open_: int) -> str:
         return f"scale: inner constraints ({open_}) over {chosen}, scale from {lengths}"
     parts = []
     if control is not None:
-        weighted = int((control.sigma > 0).sum())
+        weighted = int((~control.exact).sum())
         counts = ((len(control.sigma) - weighted, "error-free"), (weighted, "weighted"))
         parts.append(" and ".join(f"{count} {kind}" for count, kind in counts if count) + " control points")
     if priors is not None:

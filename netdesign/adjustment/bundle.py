@@ -137,8 +137,8 @@ def _add_datum(graph: Any, problem: BundleProblem) -> None:
     isotropic = gtsam.noiseModel.Isotropic.Sigma
     control, bars = problem.active_control, problem.active_bars
     if control is not None:
-        for j, xyz, sigma in zip(control.point.tolist(), control.xyz, control.sigma.tolist(), strict=True):
-            graph.add(gtsam.PriorFactorPoint3(L(j), xyz, isotropic(3, sigma)))
+        for j, xyz, sigma in zip(control.point.tolist(), control.xyz, control.sigma, strict=True):
+            graph.add(gtsam.PriorFactorPoint3(L(j), xyz, gtsam.noiseModel.Diagonal.Sigmas(sigma)))
     if bars is not None:
         for a, b, length, sigma in zip(
             bars.a.tolist(), bars.b.tolist(), bars.length.tolist(), bars.sigma.tolist(), strict=True

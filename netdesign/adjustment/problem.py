@@ -71,10 +71,10 @@ class BundleProblem:
         return np.bincount(self.observations.point, minlength=len(self.points)).astype(np.int64)
 
     def known(self) -> Bools:
-        """Return (m,): points with control coordinates that the datum uses."""
+        """Return (m,): points with control coordinates that the datum uses, known along all axes."""
         mask = np.zeros(len(self.points), dtype=np.bool_)
         if self.active_control is not None:
-            mask[self.active_control.point] = True
+            mask[self.active_control.point[self.active_control.whole]] = True
         return mask
 
     def layout(self) -> Layout:
@@ -84,7 +84,7 @@ class BundleProblem:
         fixed, kept = np.zeros_like(observed), np.zeros_like(observed)
         control = self.active_control
         if control is not None:
-            fixed[control.point[control.sigma == 0]] = True
+            fixed[control.point[control.exact]] = True
         if self.active_bars is not None:
             kept[self.active_bars.a], kept[self.active_bars.b] = True, True
         kept &= observed & ~fixed
@@ -146,7 +146,7 @@ def null_space(problem: BundleProblem, layout: Layout) -> tuple[Floats, Floats]:
     g_camera[int(layout.parameter_start[-1]) :] = rows[layout.kept].reshape(-1, 7)
     known: list[Floats] = []
     if problem.active_control is not None:
-        known.append(rows[problem.active_control.point].reshape(-1, 7))
+        known.append(rows[problem.active_control.point][np.isfinite(problem.active_control.sigma)])
     bars = problem.active_bars
     if bars is not None:
         direction = problem.points[bars.a] - problem.points[bars.b]
@@ -194,6 +194,12 @@ def check_input(problem: BundleProblem) -> None:
         raise InputError(f"point {names[point]} is observed twice in image {images[image]}")
     if problem.datum in ("control", "fixed") and (problem.control is None or len(problem.control.point) == 0):
         raise InputError(f"datum {problem.datum}: expected control points, found none")
+    if problem.datum == "fixed" and problem.control is not None and not problem.control.whole.all():
+        partly = np.unique(problem.control.point[~problem.control.whole])
+        raise InputError(
+            f"datum fixed: expected control points known along all axes, found an empty sigma for "
+            f"{listed(named(names, partly))}; datum control takes them"
+        )
     if problem.datum == "scale" and (problem.bars is None or len(problem.bars.a) == 0):
         raise InputError("datum scale: expected scale bars, found none")
     if problem.datum == "poses" and (problem.priors is None or len(problem.priors.world_from_cam) == 0):
@@ -246,9 +252,9 @@ def check_start(problem: BundleProblem) -> None:
         raise InfeasibleError(
             f"datum poses: the pose priors leave {open_} of 7 datum parameters open; expected more of them, or bars"
         )
-    if open_ and problem.datum in ("control", "fixed"):
+    if open_ and problem.datum in ("control", "fixed") and problem.control is not None:
         raise InfeasibleError(
-            f"datum {problem.datum}: {int(problem.known().sum())} control point(s) leave {open_} of 7 datum "
+            f"datum {problem.datum}: {len(problem.control.point)} control point(s) leave {open_} of 7 datum "
             "parameters open; expected at least 3 that do not lie on one line"
         )
     dependent = _dependent_bars(problem)

@@ -57,16 +57,16 @@ def _extra_equations(problem: BundleProblem, layout: Layout, linearised: Lineari
     camera_prior, camera_rhs = linearised.camera_prior.copy(), linearised.camera_prior_rhs.copy()
     control, bars, priors = problem.active_control, problem.active_bars, problem.active_priors
     if control is not None:
-        weighted = control.sigma > 0
+        weighted = ~control.exact
         index, weight = control.point[weighted], control.sigma[weighted] ** -2.0
         offset = control.xyz[weighted] - problem.points[index]
-        for j, w, d in zip(index.tolist(), weight.tolist(), offset, strict=True):
+        for j, w, d in zip(index.tolist(), weight, offset, strict=True):
             if layout.kept[j]:
                 start = int(layout.kept_start[j])
                 camera_prior[range(start, start + 3), range(start, start + 3)] += w
                 camera_rhs[start : start + 3] += w * d
             else:
-                point_prior[j] += w * np.eye(3)
+                point_prior[j] += np.diag(w)
                 point_rhs[j] += w * d
     rows: list[Floats] = []
     if bars is not None:
@@ -137,9 +137,9 @@ def cost_parts(problem: BundleProblem, whiten: Floats) -> tuple[Floats, float, F
     extra = 0.0
     control, bars = problem.active_control, problem.active_bars
     if control is not None:
-        weighted = control.sigma > 0
+        weighted = ~control.exact
         offset = control.xyz[weighted] - problem.points[control.point[weighted]]
-        extra += float(((offset / control.sigma[weighted, None]) ** 2).sum())
+        extra += float(((offset / control.sigma[weighted]) ** 2).sum())
     if bars is not None:
         distance = np.linalg.norm(problem.points[bars.a] - problem.points[bars.b], axis=1)
         weighted = bars.sigma > 0

@@ -34,22 +34,21 @@ def in_datum_frame(problem: BundleProblem) -> BundleProblem:
 
 
 def _in_control_frame(problem: BundleProblem) -> BundleProblem:
-    """An arbitrary COLMAP frame is as good a start as any. With fewer than three control points it stays as it is."""
+    """An arbitrary COLMAP frame is as good a start as any; with fewer than three whole control points it stays."""
     control = problem.active_control
     assert control is not None
     candidates = [(problem.world_from_cam, problem.points)]
     intersected, determined = _intersected(problem)
-    everywhere = np.ones(len(control.point), dtype=np.bool_)
     for source, usable in (
-        (problem.points[control.point], everywhere),
-        (intersected[control.point], determined[control.point]),
+        (problem.points[control.point], control.whole),
+        (intersected[control.point], determined[control.point] & control.whole),
     ):
         if usable.sum() >= 3 and _not_on_one_line(source[usable]) and _not_on_one_line(control.xyz[usable]):
             candidates.append(_carried(problem, *similarity(source[usable], control.xyz[usable])))
     best, best_misfit = candidates[0], np.inf
     for poses, points in candidates:
         points = points.copy()
-        points[control.point] = control.xyz
+        points[control.point] = np.where(np.isfinite(control.sigma), control.xyz, points[control.point])
         # The control points alone tell whether the frame is theirs; the others moved with the poses.
         misfit = float(_misfits(replace(problem, world_from_cam=poses), points)[control.point].sum())
         if misfit < best_misfit:

@@ -20,7 +20,9 @@ def adjust(
         typer.Option(help="what fixes the frame; default: what the set brings, else free"),
     ] = None,
     datum_points: Annotated[str | None, typer.Option(help="a,b,c…: points of the inner constraints")] = None,
-    control: Annotated[Path | None, typer.Option(help="CSV: point,x_mm,y_mm,z_mm,sigma_mm")] = None,
+    control: Annotated[
+        Path | None, typer.Option(help="CSV: point,x_mm,y_mm,z_mm,sigma_mm or sx_mm,sy_mm,sz_mm")
+    ] = None,
     scale_bars: Annotated[Path | None, typer.Option(help="CSV: a,b,length_mm,sigma_mm")] = None,
     poses: Annotated[Path | None, typer.Option(help="CSV: image,sigma_position_mm,sigma_rotation_deg[,pose]")] = None,
     refine: Annotated[str | None, typer.Option(help="any of f,fx,fy,cx,cy,k1,k2,p1,p2")] = None,

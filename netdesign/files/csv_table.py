@@ -10,8 +10,11 @@ import numpy as np
 from netdesign.errors import InputError
 
 
-def csv_rows(path: Path, required: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
+def csv_rows(path: Path, required: Sequence[str], instead: Sequence[str] = ()) -> list[tuple[str, dict[str, str]]]:
     """Return ("file:line", row) of a CSV file with at least the given columns; lines that begin with # are comments.
+
+    Args:
+        instead: columns that may stand in place of the last one required.
 
     Raises:
         InputError: no such file, not text, or a column is missing.
@@ -32,7 +35,8 @@ def csv_rows(path: Path, required: Sequence[str]) -> list[tuple[str, dict[str, s
     names = [name.strip() for name in reader.fieldnames or ()]
     reader.fieldnames = names
     missing = [name for name in required if name not in names]
-    if missing:
+    replaced = missing == [required[-1]] and bool(instead) and all(name in names for name in instead)
+    if missing and not replaced:
         raise InputError(f"{path}:{header + 1}: expected columns {','.join(required)}, found no {missing[0]}")
     rows = []
     for row in reader:

@@ -13,27 +13,48 @@ from netdesign.model.arrays import Floats
 from netdesign.model.frames import pose
 
 MM = 1e-3
+COORDINATES, AXIS_SIGMAS = ("x_mm", "y_mm", "z_mm"), ("sx_mm", "sy_mm", "sz_mm")
 
 
 def read_control(path: Path, point_names: Sequence[str]) -> ControlPoints:
-    """Read control points: point,x_mm,y_mm,z_mm,sigma_mm; sigma 0 = error-free.
+    """Read control points: point,x_mm,y_mm,z_mm and sigma_mm, or sx_mm,sy_mm,sz_mm for the axes one by one.
+
+    Sigma 0: error-free, on all axes or none. An empty sigma says that the coordinate is not known, and it may be empty
+    itself: a point known in plan or in height only. Where a row fills sx_mm, sy_mm or sz_mm, sigma_mm is not looked at.
 
     Raises:
         InputError: with file and line; an unknown or repeated point, a number that is not one, a negative sigma.
     """
     table = {name: index for index, name in enumerate(point_names)}
-    columns = ("point", "x_mm", "y_mm", "z_mm", "sigma_mm")
     index, xyz, sigma = [], [], []
-    for where, row in csv_rows(path, columns):
+    for where, row in csv_rows(path, ("point", *COORDINATES, "sigma_mm"), AXIS_SIGMAS):
         index.append(index_of(where, "control point", row["point"], table))
-        values = numbers(where, row, columns[1:])
-        if values[3] < 0:
-            raise InputError(f"{where}: sigma_mm: expected 0 (error-free) or more, found {values[3]}")
         if index[-1] in index[:-1]:
             raise InputError(f"{where}: control point {row['point']} stands in the list twice")
-        xyz.append([value * MM for value in values[:3]])
-        sigma.append(values[3] * MM)
-    return ControlPoints(point=np.array(index, dtype=np.int64), xyz=np.reshape(xyz, (-1, 3)), sigma=np.array(sigma))
+        sigma.append(_axis_sigmas(where, row))
+        known = [row[name] != "" or np.isfinite(sigma[-1][axis]) for axis, name in enumerate(COORDINATES)]
+        named = [name for name, is_known in zip(COORDINATES, known, strict=True) if is_known]
+        values = dict(zip(named, numbers(where, row, named), strict=True))
+        xyz.append([values.get(name, 0.0) * MM for name in COORDINATES])
+    return ControlPoints(
+        point=np.array(index, dtype=np.int64),
+        xyz=np.reshape(xyz, (-1, 3)),
+        sigma=np.reshape(sigma, (-1, 3)) * MM,
+    )
+
+
+def _axis_sigmas(where: str, row: dict[str, str]) -> list[float]:
+    """Return the sigmas of a control point's coordinates in mm, infinite where nothing is known."""
+    names = AXIS_SIGMAS if any(row.get(name) for name in AXIS_SIGMAS) else ("sigma_mm",) * 3
+    values = [numbers(where, row, (name,))[0] if row.get(name) else float("inf") for name in names]
+    for name, value in zip(names, values, strict=True):
+        if value < 0:
+            raise InputError(f"{where}: {name}: expected 0 (error-free) or more, found {value}")
+    if not np.isfinite(values).any():
+        raise InputError(f"{where}: expected a sigma for at least one coordinate of {row['point']}, found none")
+    if 0.0 in values and any(values):
+        raise InputError(f"{where}: expected sigma 0 (error-free) on all axes or on none, found {values}")
+    return values
 
 
 def read_scale_bars(path: Path, point_names: Sequence[str]) -> ScaleBars:

@@ -16,7 +16,9 @@ class ControlPoints:
     """Object points whose coordinates are known.
 
     Attributes:
-        point: (p,) indices.  xyz: (p, 3) m.  sigma: (p,) m per axis; 0 means error-free.
+        point: (p,) indices.  xyz: (p, 3) m.
+        sigma: (p, 3) m, or (p,) for all axes alike; 0 on all three axes: error-free; infinite: not known along that
+            axis.
     """
 
     point: Ints
@@ -26,7 +28,21 @@ class ControlPoints:
     def __post_init__(self) -> None:
         object.__setattr__(self, "point", frozen("point", self.point, ("p",), np.int64))
         object.__setattr__(self, "xyz", frozen("xyz", self.xyz, (len(self.point), 3)))
-        object.__setattr__(self, "sigma", frozen("sigma", self.sigma, (len(self.point),)))
+        sigma = np.asarray(self.sigma, dtype=np.float64)
+        spread = np.repeat(sigma[:, None], 3, axis=1) if sigma.ndim == 1 else sigma
+        object.__setattr__(self, "sigma", frozen("sigma", spread, (len(self.point), 3)))
+        if ((self.sigma == 0).any(axis=1) != (self.sigma == 0).all(axis=1)).any():
+            raise ValueError("sigma: expected 0 on all axes of a point or on none")
+
+    @property
+    def exact(self) -> Bools:
+        """(p,) which points are free of error."""
+        return np.asarray((self.sigma == 0).all(axis=1))
+
+    @property
+    def whole(self) -> Bools:
+        """(p,) which points are known along all axes."""
+        return np.asarray(np.isfinite(self.sigma).all(axis=1))
 
 
 @dataclass(frozen=True, kw_only=True)

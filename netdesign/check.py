@@ -7,16 +7,21 @@ from typing import Any
 import numpy as np
 
 from netdesign.errors import InfeasibleError
+from netdesign.files.parts import TAG_COUNT
 from netdesign.files.study import load_task
 from netdesign.imaging.plausible import fold_radius_px, image_radius_px
 from netdesign.model.progress import Progress, silent
+from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
+from netdesign.photogrammetry.connectivity import listed
+from netdesign.photogrammetry.seating import gap_to_surface
 from netdesign.placement.coverage import Coverage, coverage
 from netdesign.placement.distances import named_ends
 from netdesign.placement.preparation import free_slots, pinned_viewpoints
 
 RARELY_SEEN = 0.05
+ON_SURFACE = 0.2  # of an edge: a flat tag on a cylinder whose diameter is twice its edge stays below (0.12)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,13 +57,39 @@ def check_study(path: Path, progress: Progress = silent) -> Findings:
     if reach is not None and reach["free"] == 0.0:
         worst = max((name for name in reach if name != "free"), key=lambda name: reach[name])
         problems.append(f"the robot reaches no viewpoint of the sphere (mostly: {worst}, {reach[worst]:.0%} of it)")
-    record = _record(task, seen, reach, problems)
+    gaps = _gaps(task)
+    record = _record(task, seen, reach, problems, gaps)
+    if problems and gaps:
+        problems.append(_standing_off(gaps, task.study.targets.size_mm))
     problem = InfeasibleError(f"{path}: " + "; ".join(problems)) if problems else None
     return Findings(text=_text(record), record=record, problem=problem)
 
 
-def _record(task: Task, seen: Coverage, reach: dict[str, float] | None, problems: list[str]) -> dict[str, Any]:
+def _gaps(task: Task) -> dict[str, float]:
+    """Return the tags that do not lie on the part, and how far (mm) a corner or the centre is from its surface."""
+    targets = task.scene.targets
+    centres, corners = targets.centres, targets.points.reshape(-1, CORNERS_PER_TAG, 3)
+    places = np.concatenate([centres[:, None], corners], axis=1)
+    gap = gap_to_surface(task.scene.part, places.reshape(-1, 3)).reshape(len(centres), -1).max(axis=1)
+    found = zip(targets.ids.tolist(), gap.tolist(), strict=True)
+    return {str(tag): far * 1e3 for tag, far in found if far > ON_SURFACE * targets.size_m}
+
+
+def _standing_off(gaps: dict[str, float], size_mm: float) -> str:
+    """Return the sentence about tags that do not lie on the part."""
+    worst = sorted(gaps.items(), key=lambda item: -item[1])
+    names = listed([f"{tag} ({far:.4g} mm)" for tag, far in worst])
+    return (
+        f"{len(gaps)} tag(s) do not lie on the part, a corner is farther from the surface than "
+        f"{ON_SURFACE * size_mm:g} mm: {names}"
+    )
+
+
+def _record(
+    task: Task, seen: Coverage, reach: dict[str, float] | None, problems: list[str], gaps: dict[str, float]
+) -> dict[str, Any]:
     part, targets = task.scene.part, task.scene.targets
+    placed = len(targets.ids) + len(task.left_out)
     near, far = task.camera.depth_of_field()
     return {
         "study": task.study.name,
@@ -67,6 +98,9 @@ def _record(task: Task, seen: Coverage, reach: dict[str, float] | None, problems
         "tags": len(targets.ids),
         "points": len(targets.points),
         "left_out": list(task.left_out),
+        "ids_used_up": task.study.targets.spacing_mm is not None and placed == TAG_COUNT[targets.family],
+        "gap_mm": gaps,
+        "tag_mm": task.study.targets.size_mm,
         "fold_px": fold_radius_px(task.camera.intrinsics),
         "corner_px": image_radius_px(task.camera),
         "depth_of_field_mm": [near * 1e3, far * 1e3],
@@ -89,6 +123,8 @@ def _text(record: dict[str, Any]) -> str:
         f"part       {record['part']['triangles']} triangles, {size} mm",
         f"tags       {record['tags']} tags, {record['points']} object points",
     ]
+    if record["ids_used_up"]:
+        lines.append("  these are all ids of the family: with a larger targets.spacing_mm they would reach more faces")
     if record["left_out"]:
         names = ", ".join(str(tag) for tag in record["left_out"][:12])
         more = len(record["left_out"]) - 12
@@ -96,6 +132,8 @@ def _text(record: dict[str, Any]) -> str:
             f"  left out, seen from too little of the sphere (targets.min_seen_share): {len(record['left_out'])} tags, "
             f"{names}{f' and {more} more' if more > 0 else ''}"
         )
+    if record["gap_mm"]:
+        lines.append(f"  {_standing_off(record['gap_mm'], record['tag_mm'])}")
     near, far = record["depth_of_field_mm"]
     if np.isfinite(far) or near > 0:
         lines.append(f"sharp      {near:.0f} mm to {far:.0f} mm along the optical axis")

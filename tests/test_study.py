@@ -7,6 +7,8 @@ import trimesh
 from netdesign.check import check_study
 from netdesign.errors import InfeasibleError, InputError
 from netdesign.files.study import load_task, resolve, write_resolved
+from netdesign.model.scene import Part
+from netdesign.photogrammetry.seating import gap_to_surface
 
 STUDY = """format = 1
 name = "box"
@@ -111,7 +113,9 @@ def test_not_a_mesh(study, tmp_path):
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("1,0,0,50,0,0,1,1,0", "integer and nine numbers"),
+        ("1,0,0,50,0,0,1,1,0", "expected 10 values"),
+        ("1.5,0,0,50,0,0,1,1,0,0", "integer and nine numbers"),
+        ("1,0,0,50,0,0,1,1,0,0\n2,14,14,50.5,0,0,1,1,1,0", r"1 pair\(s\) that overlap .*: 1 and 2"),
         ("600,0,0,50,0,0,1,1,0,0", "tag id from 0 to 586"),
         ("0,0,0,50,0,0,0,1,0,0", "a direction"),
         ("0,0,0,50,0,0,1,0,1,1", "right angles"),
@@ -123,6 +127,50 @@ def test_wrong_tag_lists(study, tmp_path, line, says):
     (tmp_path / "tags.csv").write_text(f"tag,x_mm,y_mm,z_mm,nx,ny,nz,ux,uy,uz\n{line}\n")
     with pytest.raises(InputError, match=says):
         load_task(study("spacing_mm = 45", 'file = "tags.csv"'))
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_tag_lists_of_spreadsheets(study, tmp_path, mark):
+    """Byte order mark, other separators, Windows line ends, comments, ids with a zero behind their point."""
+    lines = [
+        "tag,x_mm,y_mm,z_mm,nx,ny,nz,ux,uy,uz,glued",
+        "3.0,0,0,50,0,0,1,1,0,0,yes",
+        "# moved",
+        "7,20.2,0,50,0,0,1,1,0,0,no",
+    ]
+    text = "\r\n".join(["\ufeff" + lines[0], *lines[1:], ""]).replace(",", mark)
+    (tmp_path / "tags.csv").write_bytes(text.encode())
+    targets = load_task(study("spacing_mm = 45", 'file = "tags.csv"')).scene.targets
+    assert targets.ids.tolist() == [3, 7]
+    np.testing.assert_allclose(targets.centres, [[0, 0, 0.05], [0.0202, 0, 0.05]], atol=1e-15)
+
+
+def test_check_names_tags_that_stand_off_the_part(study, tmp_path):
+    """In the air, inside, over the edge; and on a cylinder, where corners are off by sqrt(r² + s²/4) - r."""
+    rows = ["0,0,0,50,0,0,1,1,0,0", "1,50,0,54.2,0,0,1,1,0,0", "2,-50,0,30,0,0,1,1,0,0", "3,95,40,50,0,0,1,1,0,0"]
+    (tmp_path / "tags.csv").write_text("\n".join(["tag,x_mm,y_mm,z_mm,nx,ny,nz,ux,uy,uz", *rows]) + "\n")
+    path = study("spacing_mm = 45", 'file = "tags.csv"')
+    found = check_study(path)
+    assert found.record["gap_mm"] == {
+        "1": pytest.approx(4.2, abs=1e-9), "2": pytest.approx(20, abs=1e-9), "3": pytest.approx(5, abs=1e-9)
+    }  # fmt: skip
+    assert "3 tag(s) do not lie on the part" in found.text
+    assert "2 (20 mm), 3 (5 mm), 1 (4.2 mm)" in str(found.problem)
+    part = Part(vertices=(cylinder := trimesh.creation.cylinder(40, 200, sections=2000)).vertices, faces=cylinder.faces)
+    gap = gap_to_surface(part, np.array([[40, 10, 0], [40, 0, 0], [0, 0, 110], [0, 0, 0], [70, 0, 140]]))
+    np.testing.assert_allclose(gap, [np.hypot(40, 10) - 40, 0, 10, 40, 50], atol=2e-4)
+
+
+def test_check_says_when_the_family_has_no_more_ids(study):
+    more = study("size_mm = 20.0\nspacing_mm = 45", "size_mm = 5.0\nspacing_mm = 8\nmin_seen_share = 0.01")
+    assert "these are all ids of the family" in check_study(more).text
+    assert "all ids" not in check_study(study()).text
+
+
+def test_cad_is_no_mesh(study, tmp_path):
+    (tmp_path / "box.STEP").write_text("ISO-10303-21;")
+    with pytest.raises(InputError, match=r"box\.STEP: expected a triangle mesh .* export it as STL"):
+        load_task(study("box.stl", "box.STEP"))
 
 
 def test_a_resolved_run_can_be_moved(study, tmp_path):

@@ -30,7 +30,7 @@ def csv_rows(path: Path, required: Sequence[str], instead: Sequence[str] = ()) -
     # Comments become empty lines, which csv passes over: the line numbers stay right.
     lines = ["" if line.lstrip().startswith("#") else line for line in text.split("\n")]
     header = next((number for number, line in enumerate(lines) if line.strip()), 0)
-    delimiter = ";" if ";" in lines[header] and "," not in lines[header] else ","
+    delimiter = next((mark for mark in ",;\t" if mark in lines[header]), ",")
     reader = csv.DictReader(io.StringIO("\n".join(lines[header:])), skipinitialspace=True, delimiter=delimiter)
     names = [name.strip() for name in reader.fieldnames or ()]
     reader.fieldnames = names

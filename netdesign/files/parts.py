@@ -1,7 +1,5 @@
 """Parts and targets: meshes, tag lists, and tags spread over the faces of a mesh."""
 
-import csv
-import io
 import warnings
 from pathlib import Path
 
@@ -9,6 +7,7 @@ import numpy as np
 import trimesh
 
 from netdesign.errors import InputError
+from netdesign.files.csv_table import csv_rows
 from netdesign.model.arrays import Floats
 from netdesign.model.frames import transform
 from netdesign.model.scene import Part, Targets
@@ -16,6 +15,7 @@ from netdesign.model.scene import Part, Targets
 UNIT_M = {"mm": 1e-3, "m": 1.0, "inch": 0.0254}
 TAG_COLUMNS = ("tag", "x_mm", "y_mm", "z_mm", "nx", "ny", "nz", "ux", "uy", "uz")
 TAG_COUNT = {"tag36h11": 587}
+CAD = {".step", ".stp", ".iges", ".igs", ".brep", ".sldprt", ".ipt", ".catpart", ".prt", ".x_t", ".fcstd"}
 PHASES = 12  # steps of a spacing by which a grid is moved to make tags fit
 CELLS_PER_TAG = 8  # the black square of 36h11 is 8 cells wide; one white cell around it is the quiet zone
 
@@ -31,6 +31,8 @@ def load_part(path: Path, unit: str, world_from_mesh: Floats) -> Part:
     """
     if not path.is_file():
         raise InputError(f"{path}: no such mesh (part.mesh)")
+    if path.suffix.lower() in CAD:
+        raise InputError(f"{path}: expected a triangle mesh (STL, OBJ, PLY, OFF, GLB), found CAD: export it as STL")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -64,15 +66,10 @@ def load_targets(path: Path, family: str, size_m: float, world_from_mesh: Floats
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file (targets.file)")
-    reader = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig")))
-    missing = [name for name in TAG_COLUMNS if name not in (reader.fieldnames or ())]
-    if missing:
-        raise InputError(f"{path}:1: expected columns {','.join(TAG_COLUMNS)}, found no {missing[0]}")
     tags: dict[int, tuple[Floats, Floats, Floats]] = {}
-    for line in reader:
-        where = f"{path}:{reader.line_num}"
+    for where, line in csv_rows(path, TAG_COLUMNS):
         try:
-            tag, values = int(line["tag"]), np.array([float(line[name]) for name in TAG_COLUMNS[1:]])
+            tag, values = _whole_number(line["tag"]), np.array([float(line[name]) for name in TAG_COLUMNS[1:]])
         except (TypeError, ValueError):
             raise InputError(f"{where}: expected an integer and nine numbers, found {list(line.values())}") from None
         if not 0 <= tag < TAG_COUNT[family]:
@@ -102,6 +99,17 @@ def load_targets(path: Path, family: str, size_m: float, world_from_mesh: Floats
         size_m=size_m,
         family=family,
     )
+
+
+def _whole_number(text: str) -> int:
+    """Return an integer, written as one or, as spreadsheets do, with a zero behind its point."""
+    try:
+        return int(text)
+    except ValueError:
+        value = float(text)
+        if not value.is_integer():
+            raise
+        return int(value)
 
 
 def spread_targets(part: Part, family: str, size_m: float, spacing_m: float) -> Targets:

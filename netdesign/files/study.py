@@ -26,6 +26,8 @@ from netdesign.model.scene import Part, Scene, Targets
 from netdesign.model.stations import Depth, ViewingSphere
 from netdesign.model.study import CameraTable, PartTable, Study, ViewpointsTable, VisibilityTable
 from netdesign.model.task import Task, VisibilityLimits
+from netdesign.photogrammetry.connectivity import listed
+from netdesign.photogrammetry.seating import overlapping
 from netdesign.photogrammetry.visibility import seen_share
 
 MM = 1e-3
@@ -170,7 +172,15 @@ def _targets(study: Study, path: Path, part: Part, world_from_mesh: Floats) -> T
     table = study.targets
     size = table.size_mm * MM
     if table.file is not None:
-        return load_targets(_beside(path, table.file), table.family, size, world_from_mesh)
+        targets = load_targets(_beside(path, table.file), table.family, size, world_from_mesh)
+        shared = overlapping(targets)
+        if shared:
+            raise InputError(
+                f"{_beside(path, table.file)}: expected tags of {table.size_mm:g} mm beside each other, found "
+                f"{len(shared)} pair(s) that overlap (x_mm, y_mm, z_mm are millimetres): "
+                f"{listed([f'{one} and {other}' for one, other in shared])}"
+            )
+        return targets
     assert table.spacing_mm is not None  # the table has exactly one of the two
     return spread_targets(part, table.family, size, table.spacing_mm * MM)
 

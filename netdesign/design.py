@@ -105,7 +105,9 @@ def _summary(task: Task, run: Path, design: Design, evaluations: int) -> str:
         sigma = [1e6 * network.precision.mean_variance**0.5 for network in layer]
         tour = [scale * network.f2 for network in layer]
         lines.append(
-            f"  {size:2d} images: {len(layer)} networks, rms sigma {min(sigma):.2f} to {max(sigma):.2f} um, "
+            f"  {size:2d} images: 1 network, rms sigma {sigma[0]:.2f} um, tour {tour[0]:.4g} {unit}"
+            if len(layer) == 1
+            else f"  {size:2d} images: {len(layer)} networks, rms sigma {min(sigma):.2f} to {max(sigma):.2f} um, "
             f"tour {min(tour):.4g} to {max(tour):.4g} {unit}"
         )
     lines += design.notes

@@ -103,7 +103,7 @@ def _mm(pose: Floats) -> Floats:
 def _text(record: dict[str, Any], output: Path | None) -> str:
     """Return the tables that a person reads: the network, its images from the least to the most needed, additions."""
     now = record["now"]
-    head = f"{'':<26}{'rms sigma':>10}{'':>7}{'largest':>10}{'total rms':>11}{'rays':>6}"
+    head = f"{'':<26}{'rms sigma':>10}{'':>9}{'largest':>10}{'total rms':>11}{'rays':>6}"
     lines = [head, _line(f"now, {now['images']} images", now, None)]
     drops = sorted(record["drop"], key=lambda item: (item["points_below_min_rays"], item["f1_mm2"], item["image"]))
     lines += [_line(f"  without image {item['image'] + 1}", item, now) for item in drops]
@@ -134,7 +134,7 @@ def _line(name: str, quality: dict[str, Any], against: dict[str, Any] | None) ->
     rays = f"{quality['fewest_rays']}"
     note = f"  {quality['points_below_min_rays']} points below" if quality["points_below_min_rays"] else ""
     return (
-        f"{name:<26}{_sigma(quality['rms_sigma_um']):>10}{change:>7}{_sigma(quality['max_sigma_um']):>10}"
+        f"{name:<26}{_sigma(quality['rms_sigma_um']):>10} {change:>8}{_sigma(quality['max_sigma_um']):>10}"
         f"{'open' if total is None else _sigma(total):>11}{rays:>6}{note}"
     )
 

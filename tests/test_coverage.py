@@ -51,6 +51,25 @@ def test_tags_that_nobody_sees_are_named_with_the_reason():
     assert REASONS[2] in high.obstacles[0]
 
 
+def test_two_sides_that_no_viewpoint_sees_together_are_no_network():
+    """A sheet with tags on both faces: front and back images have nothing in common, whatever is chosen."""
+    front = plate_scene(side=3, spacing=0.06)
+    part, targets = front.part, front.targets
+    both = replace(
+        targets, ids=np.concatenate([targets.ids, targets.ids + 100]),
+        centres=np.concatenate([targets.centres, targets.centres - [0, 0, np.ptp(part.vertices[:, 2])]]),
+        normals=np.concatenate([targets.normals, -targets.normals]),
+        x_axes=np.concatenate([targets.x_axes, targets.x_axes]),
+    )  # fmt: skip
+    around = sphere(elevation=(-90, 90))
+    found = coverage(make_task(replace(front, targets=both), stations=around))
+    assert [len(group) for group in found.groups] == [9, 9]
+    assert found.groups[1][0] == 100
+    with pytest.raises(InfeasibleError, match="the tags fall into 2 groups of which no viewpoint sees two"):
+        found.demand_feasible()
+    assert coverage(make_task(front)).obstacles == ()
+
+
 def test_a_single_tag_is_no_image():
     found = coverage(make_task(plate_scene(side=1)))
     assert found.lonely.all()

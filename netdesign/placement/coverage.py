@@ -10,6 +10,7 @@ from netdesign.errors import InfeasibleError
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
+from netdesign.photogrammetry.connectivity import components, listed
 from netdesign.photogrammetry.visibility import REASONS, SAMPLE_STEP, SEEN, sightings
 from netdesign.placement.visibility_map import VisibilityMap
 
@@ -28,8 +29,10 @@ class Coverage:
         admissible: share of the sphere from which an image holds ``min_points_per_image`` points.
         least_images: proven lower bound on the number of images that give every point its ``min_rays``; 0 when some
             tag is never or lonely, so that no number is enough.
+        groups: ids of tags by groups that no image can tie together: no viewpoint sees tags of two of them. One group
+            where something of the above is wrong already, or where existing stations may tie them.
         max_images, min_rays, min_points_per_image: of the study.
-        proved: False when there is no map, and never, lonely and least_images are those of the sample.
+        proved: False when there is no map, and never, lonely, groups and least_images are those of the sample.
     """
 
     tag_ids: NDArray[np.int64]
@@ -40,6 +43,7 @@ class Coverage:
     lonely: Bools
     admissible: float
     least_images: int
+    groups: tuple[tuple[int, ...], ...]
     max_images: int
     min_rays: int
     min_points_per_image: int
@@ -87,6 +91,13 @@ class Coverage:
                 f"viewpoints.max_images: at least {self.least_images} images are needed to give every object point "
                 f"{self.min_rays} rays, allowed are {self.max_images}"
             )
+        if not lines and len(self.groups) > 1:
+            sizes = [f"{len(group)} ({listed([str(tag) for tag in group], 3)})" for group in self.groups]
+            lines.append(
+                f"the tags fall into {len(self.groups)} groups of which no {'' if self.proved else 'sampled '}"
+                f"viewpoint sees two, so that images of one cannot be tied to those of another: {listed(sizes)}; they "
+                "need studies of their own, tags between them, or a larger visibility.max_incidence_deg"
+            )
         return tuple(lines)
 
     def demand_feasible(self) -> None:
@@ -123,11 +134,19 @@ def coverage(task: Task, visibility_map: VisibilityMap | None = None) -> Coverag
         lonely=~never & ~together,
         admissible=float(weights[(reason == SEEN).sum(axis=1) * CORNERS_PER_TAG >= limits.min_points_per_image].sum()),
         least_images=0 if not together.all() else least_images(possible[enough], limits.min_rays),
+        groups=_groups(possible[enough], scene.targets.ids) if together.all() and not len(task.existing) else (),
         max_images=sphere.max_images,
         min_rays=limits.min_rays,
         min_points_per_image=limits.min_points_per_image,
         proved=proved,
     )
+
+
+def _groups(possible: Bools, tag_ids: NDArray[np.int64]) -> tuple[tuple[int, ...], ...]:
+    """Return the ids of tags that rows of ``possible`` (c, g) tie together, the largest group first."""
+    label = components(possible)[1]
+    found = [tuple(tag_ids[label == one].tolist()) for one in np.unique(label)]
+    return tuple(sorted(found, key=lambda group: (-len(group), group)))
 
 
 def least_images(possible: Bools, min_rays: int) -> int:

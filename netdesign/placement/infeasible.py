@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from netdesign.photogrammetry.connectivity import loose_images
+from netdesign.photogrammetry.connectivity import components, listed, loose_images
 from netdesign.placement.decide import round_up
 from netdesign.placement.network_problem import NetworkProblem
 from netdesign.search.engine import run as search
@@ -33,7 +33,7 @@ def why_infeasible(problem: NetworkProblem, state: State) -> str:
         parts.append(f"{poor} of {len(viewpoints)} images see fewer than {limits.min_points_per_image} points")
     loose = loose_images(np.concatenate([sees, problem.existing_sees]))
     if loose:
-        parts.append(f"{loose} of {len(viewpoints)} images share no object point with the others")
+        parts.append(f"{loose} of {len(viewpoints)} images share no object point with the others{_groups(problem)}")
     if problem.joint_map is not None:
         refused = (~problem.joint_map.reachable(viewpoints)).sum()
         if refused:
@@ -43,6 +43,16 @@ def why_infeasible(problem: NetworkProblem, state: State) -> str:
     if not parts:
         parts.append("some points are seen under nearly parallel rays")
     return f"no admissible network among {state.evaluations[-1]} evaluated; of the nearest one " + ", ".join(parts)
+
+
+def _groups(problem: NetworkProblem) -> str:
+    """Say that no choice of candidate stations ties all tags together; empty when some choice does."""
+    sees = np.concatenate([problem.sees(problem.candidates()), problem.existing_sees])
+    sizes = np.unique(components(sees)[1], return_counts=True)[1]
+    if len(sizes) < 2:
+        return ""
+    each = listed([str(size) for size in sorted(sizes.tolist(), reverse=True)])
+    return f" (no candidate station sees tags of two of the {len(sizes)} groups of {each} tags: studies of their own?)"
 
 
 def _rare_tags(problem: NetworkProblem) -> str:

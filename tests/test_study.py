@@ -83,6 +83,16 @@ def test_tags_lie_on_faces_and_do_not_overlap(study):
         ("format = 1", "format = 2", r"format: expected 1, found 2"),
         ("format = 1", "format = ", r"expected TOML"),
         ('name = "box"', "", r"name: expected a value, found none"),
+        ('name = "box"', 'name = "../box"', r"name: expected a name without / .*, found '\.\./box'"),
+        ('name = "box"', 'name = ".."', r"name: expected a name without / .*, found '\.\.'"),
+        ('name = "box"', 'name = ""', r"name: expected text, found ''"),
+        ("box.stl", ".", r"expected a file, found a folder, named in"),
+        ("[3600, 3600]", "3600", r"camera\.focal_px: expected a list in brackets, found 3600"),
+        (
+            "[camera]",
+            "[camera]\ndistortion = [0, 0, 0, 0, 0]",
+            r"camera\.distortion: expected a list of 4, found one of 5",
+        ),
         ("[camera]", '[objectives]\nmotion = "joint"\n[camera]', r"joint needs a \[robot\] table"),
     ],
 )
@@ -171,6 +181,12 @@ def test_cad_is_no_mesh(study, tmp_path):
     (tmp_path / "box.STEP").write_text("ISO-10303-21;")
     with pytest.raises(InputError, match=r"box\.STEP: expected a triangle mesh .* export it as STL"):
         load_task(study("box.stl", "box.STEP"))
+
+
+def test_a_byte_order_mark_is_no_mistake(study):
+    path = study()
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert load_task(path).study.name == "box"
 
 
 def test_a_resolved_run_can_be_moved(study, tmp_path):

@@ -81,6 +81,8 @@ def resolve(path: Path, seed: int | None = None) -> ResolvedStudy:
 
     def take(file: str, name: str) -> str:
         source = _beside(path, file)
+        if source.is_dir():
+            raise InputError(f"{source}: expected a file, found a folder, named in {path}")
         if not source.is_file():
             raise InputError(f"{source}: no such file, named in {path}")
         inputs[name] = source.read_bytes()
@@ -195,7 +197,8 @@ def _worth_measuring(
     kept = seen_share(scene, camera, sphere, limits) >= least
     if not kept.any():
         raise InfeasibleError(
-            f"{path}: targets.min_seen_share: none of the {len(kept)} tags is seen from {least:.1%} of the sphere"
+            f"{path}: targets.min_seen_share: none of the {len(kept)} tags is seen from {least:.1%} of the sphere; "
+            "without this key `netdesign check` counts what refuses them"
         )
     ids: Ints = scene.targets.ids[~kept]
     return replace(scene, targets=scene.targets.take(kept)), tuple(ids.tolist())

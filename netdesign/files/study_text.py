@@ -19,7 +19,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         InputError: no such file, not UTF-8, or not TOML (with line and column).
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        # Editors on Windows put a byte order mark before the text.
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{path}: no such file") from None
     except IsADirectoryError:
@@ -60,6 +61,14 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     if problem["type"] == "missing":
         return f"{place}: expected a value, found none{more}"
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    context = problem.get("ctx", {})
+    if problem["type"] in ("tuple_type", "list_type"):
+        message = "a list in brackets"
+    elif problem["type"] in ("too_long", "too_short"):
+        wanted = context.get("max_length", context.get("min_length"))
+        return f"{place}: expected a list of {wanted}, found one of {context.get('actual_length')}{more}"
+    elif problem["type"] in ("string_too_short", "string_pattern_mismatch"):
+        message = "text" if problem["type"] == "string_too_short" else "a name without / and \\, not . or .."
     if problem["type"] == "value_error":
         return f"{place}: {message}{more}" if place else f"{message}{more}"
     return f"{place}: expected {message}, found {problem['input']!r}{more}"

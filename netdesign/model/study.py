@@ -247,7 +247,8 @@ class Study(Table):
     """A whole study file."""
 
     format: Literal[1]
-    name: Annotated[str, Field(min_length=1)]
+    # It names the run directory, runs/<name>.
+    name: Annotated[str, Field(min_length=1, pattern=r"^[^/\\]*[^/\\.][^/\\]*$")]
     seed: Annotated[int, Field(ge=0)] = 1
     part: PartTable
     targets: TargetsTable

@@ -7,6 +7,7 @@ from typing import Any, cast
 import typer
 
 from netdesign.commands import designing, imaging, results
+from netdesign.environment import prepare_environment
 from netdesign.errors import NetdesignError
 from netdesign.interruption import end_cleanly
 
@@ -41,7 +42,7 @@ app = application()
 
 def main() -> None:
     """Run the command line and leave with the exit status of the contract."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads would only wait for each other
+    prepare_environment()
     end_cleanly()
     try:
         if app(standalone_mode=False) == 130:  # what Typer makes of a KeyboardInterrupt
@@ -57,8 +58,14 @@ def main() -> None:
         _complain(f"netdesign: {refusal}", refusal.exit_status)
     except (KeyboardInterrupt, typer.Abort):
         _complain("netdesign: interrupted, what is done is kept", 130)
-    except BrokenPipeError:  # the reader of our output has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as problem:
+        if isinstance(problem, BrokenPipeError):  # the reader of our output has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return
+        if problem.filename is None:  # no file that a user could have named
+            raise
+        place = problem.filename2 or problem.filename
+        _complain(f"netdesign: {place}: cannot be read or written: {problem.strerror}", 2)
 
 
 def _complain(line: str, status: int) -> None:

@@ -37,6 +37,10 @@ def export(run: Path, network_id: int, format: Format, out: Path) -> Path:
     """
     task = open_run(run)
     network = find_network(run, network_id)
+    if format == "colmap" and out.is_file():
+        raise InputError(f"{out}: expected a folder for colmap, found a file")
+    if format != "colmap" and out.is_dir():
+        raise InputError(f"{out}: expected a file for {format}, found a folder")
     if format == "colmap":
         write_model(out, _colmap(task, network))
     elif task.cell is None or network.joints is None:

@@ -1,9 +1,15 @@
 """The command line: one clear line and the exit status of the contract."""
 
+import os
 import subprocess
 import sys
 
 import pytest
+
+from netdesign.environment import prepare_environment
+from netdesign.errors import InputError
+from netdesign.export import export
+from tests.runs import ring_run
 
 
 def netdesign(*arguments, cwd=None):
@@ -34,6 +40,38 @@ def test_wrong_usage_is_one_line_and_status_2(tmp_path, arguments, says):
     assert result.stderr.count("\n") == 1
     assert result.stdout == ""
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_written_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    result = netdesign("new", tmp_path / "file" / "study")
+    assert result.returncode == 2
+    assert result.stderr.startswith(f"netdesign: {tmp_path / 'file'}")
+    assert result.stderr.endswith(": cannot be read or written: Not a directory\n")
+    assert result.stderr.count("\n") == 1
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_exports_neither_replace_folders_nor_write_into_files(tmp_path):
+    ring_run(tmp_path / "run", sizes=(8,))
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="expected a file for csv, found a folder"):
+        export(tmp_path / "run", 0, "csv", tmp_path)
+    with pytest.raises(InputError, match="expected a folder for colmap, found a file"):
+        export(tmp_path / "run", 0, "colmap", tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("writable", [True, False])
+def test_kernels_are_kept_somewhere_even_where_nothing_can_be_written(monkeypatch, writable):
+    monkeypatch.setattr("netdesign.environment.os.access", lambda place, mode: writable)
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    prepare_environment()
+    chosen = os.environ.pop("NUMBA_CACHE_DIR", None)
+    assert (chosen is None) == writable
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/mine")
+    prepare_environment()
+    assert os.environ["NUMBA_CACHE_DIR"] == "/mine"
 
 
 COMMANDS = (

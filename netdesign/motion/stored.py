@@ -27,7 +27,7 @@ def content_key(kind: str, *parts: Any) -> str:
 
 def stored(key: str, build: Callable[[], Arrays]) -> Arrays:
     """Return the arrays kept under ``key``, or build and keep them; a cache that cannot be written is no error."""
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "netdesign" / "motion"
+    root = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "netdesign" / "motion"
     path = root / f"{key[:40]}.npz"
     found = _read(path)
     if found is not None:

@@ -222,7 +222,7 @@ def _cache_path(*arrays: Floats) -> Path:
     digest = hashlib.sha256(f"{VERSION} {COARSEST}".encode())
     for array in arrays:
         digest.update(str(array.shape).encode() + np.ascontiguousarray(array, np.float64).tobytes())
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    root = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
     return root / "netdesign" / f"visibility-{digest.hexdigest()[:32]}.npz"
 
 

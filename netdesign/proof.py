@@ -15,7 +15,7 @@ import numpy as np
 from netdesign.adjustment.absolute import absolute_comparison, absolute_prediction, repeatability_priors
 from netdesign.adjustment.bundle import adjust
 from netdesign.adjustment.compare import compare
-from netdesign.adjustment.correlated import correlated_covariance
+from netdesign.adjustment.correlated import correlated_errors
 from netdesign.adjustment.estimate import estimate
 from netdesign.adjustment.lengths import length_test
 from netdesign.adjustment.problem import BundleProblem
@@ -100,10 +100,12 @@ def prove_network(
     }
     try:
         start, adjustment = _adjusted(task, network, observations, names)
-        joint = correlated_covariance(adjustment, _by_image_and_tag(observations, tag_covariances))
+        joint, sums = correlated_errors(adjustment, _by_image_and_tag(observations, tag_covariances))
         limited, total = predictions(task, network)
         truth = task.scene.targets.points
-        validation = compare(truth, adjustment, limited, total, level, seed=task.study.seed, joint_covariance=joint)
+        validation = compare(
+            truth, adjustment, limited, total, level, seed=task.study.seed, joint_covariance=joint, sums=sums
+        )
         lengths = length_payload(length_test(truth, adjustment), point_ids)
         absolute = _in_robot_frame(task, network, start, level)
     except EnvironmentProblem:

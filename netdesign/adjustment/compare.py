@@ -6,6 +6,7 @@ the observations that were used (P2), M the points' normal matrix reduced for ev
     T    = dᵀ M d             chi² (nu)        the whole covariance, correlations and the a-priori sigma included
     s0²  = vᵀ P v / r         chi² (r)/r       the noise of the image points
     F    = (T/nu) / s0²       F (nu, r)        the geometry alone: the a-priori sigma cancels
+                                               (scaled, with fewer degrees of freedom, where image points correlate)
     rho  = sqrt(dᵀd / tr Σ)   weighted chi²    the number a user understands
     coverage, NEES            sampled from N(0, Σ)
 
@@ -18,6 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2
 
 from netdesign.adjustment.statistics import (
+    SumsOfSquares,
     chi2_interval,
     f_interval,
     log_rms_moments,
@@ -44,6 +46,7 @@ def compare(
     level: float = LEVEL,
     seed: int = 0,
     joint_covariance: Floats | None = None,
+    sums: SumsOfSquares | None = None,
 ) -> Validation:
     """Return the verdict on one network.
 
@@ -53,7 +56,7 @@ def compare(
         limited, total: predictions at design (P0, P1), for the same m points.
         level: of the intervals.  seed: of the draws for coverage and NEES.
         joint_covariance: Σ (3m, 3m) m² where it is not the adjustment's own, as when image points are correlated
-            (``correlated``).
+            (``correlated``).  sums: what T and vᵀPv are expected to be then.
 
     Raises:
         InfeasibleError: fewer than four points have an estimate, or the network has no redundancy.
@@ -80,9 +83,11 @@ def compare(
     t_sum = _quadratic_form(adjustment, error)
     s0_squared = adjustment.sigma0**2
     nees, inside, nees_draws, inside_draws = _ellipsoids(error, joint, values, vectors, seed)
-    t = chi2_interval(t_sum / nu, nu, level)
-    s0 = chi2_interval(s0_squared, r, level)
-    ratio = f_interval(t_sum / nu / s0_squared, nu, r, level)
+    expected = sums or SumsOfSquares.independent(nu, r)
+    t_mean, s0_mean = expected.t_mean / nu, expected.v_mean / r
+    t = chi2_interval(t_sum / nu, expected.t_dof, level, t_mean)
+    s0 = chi2_interval(s0_squared, expected.v_dof, level, s0_mean)
+    ratio = f_interval(t_sum / nu / s0_squared, *expected.ratio_dofs, level, t_mean / s0_mean)
     rho = rms_interval(float(np.sqrt((error**2).sum() / values.sum())), values, level)
     errors = np.full((len(used), 3), np.nan)
     errors[used] = aligned - truth[used]

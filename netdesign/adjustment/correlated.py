@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from netdesign.adjustment.compare import point_equations
+from netdesign.adjustment.statistics import SumsOfSquares
 from netdesign.model.adjustment import Adjustment
 from netdesign.model.arrays import Floats
 from netdesign.model.scene import CORNERS_PER_TAG
@@ -24,8 +25,10 @@ from netdesign.photogrammetry.datum import inner_basis
 from netdesign.photogrammetry.observation_equations import whitener
 
 
-def correlated_covariance(adjustment: Adjustment, tag_covariance: Mapping[tuple[int, int], Floats]) -> Floats:
-    """Return the joint covariance (3m, 3m) m² of the points, inf for unused ones, in the free datum.
+def correlated_errors(
+    adjustment: Adjustment, tag_covariance: Mapping[tuple[int, int], Floats]
+) -> tuple[Floats, SumsOfSquares]:
+    """Return the joint covariance (3m, 3m) m² of the points, inf for unused ones, in the free datum; and T and vᵀPv.
 
     Args:
         adjustment: free datum; point p is corner p mod 4 of tag p div 4.
@@ -37,7 +40,8 @@ def correlated_covariance(adjustment: Adjustment, tag_covariance: Mapping[tuple[
     place = np.full(len(adjustment.points), -1)
     place[used] = np.arange(len(used))
     width, size = linearised.width, linearised.width + 3 * len(used)
-    normal, middle = np.zeros((size, size)), np.zeros((size, size))
+    normal, middle, outer = (np.zeros((size, size)) for _ in range(3))
+    trace, trace_of_square = 0.0, 0.0
     tag = observations.point // CORNERS_PER_TAG
     order = np.lexsort((tag, observations.image))
     starts = np.flatnonzero(np.diff(observations.image[order], prepend=-1) | np.diff(tag[order], prepend=-1))
@@ -60,23 +64,58 @@ def correlated_covariance(adjustment: Adjustment, tag_covariance: Mapping[tuple[
         whitened = turned @ whole[np.ix_(seat, seat)] @ turned.T
         normal[np.ix_(unknowns, unknowns)] += design.T @ design
         middle[np.ix_(unknowns, unknowns)] += design.T @ whitened @ design
-    covariance = _between(normal, middle, adjustment.points[used], width)
+        outer[np.ix_(unknowns, unknowns)] += design.T @ whitened @ whitened @ design
+        trace += float(np.trace(whitened))
+        trace_of_square += float((whitened**2).sum())
+    covariance, through, outside = _between(normal, middle, outer, adjustment.points[used], width)
+    sums = _sums_of_squares(normal, middle, outer, through, outside, width, (trace, trace_of_square))
     joint = np.zeros((3 * len(adjustment.points),) * 2)
     all_rows = np.repeat(adjustment.used, 3)
     joint[np.ix_(all_rows, all_rows)] = covariance
     unused = np.flatnonzero(~all_rows)
     joint[unused, unused] = np.inf
-    return joint
+    return joint, sums
 
 
-def _between(normal: Floats, middle: Floats, points: Floats, width: int) -> Floats:
-    """Return the points' part of Q M Q, Q the inverse of the normals with inner constraints over the points (u, 3)."""
+def _between(normal: Floats, middle: Floats, outer: Floats, points: Floats, width: int) -> tuple[Floats, Floats, float]:
+    """Return the points' part of Q M Q, Q M and tr(Q O), Q the inverse with inner constraints over points (u, 3)."""
     scale = 1.0 / np.sqrt(np.diag(normal))
     constraints = np.zeros((len(normal), 7))
     constraints[width:] = inner_basis(points)
     held = np.linalg.qr(scale[:, None] * constraints)[0]
-    # The normals times the motions vanish, so that constraints may be added as observations without changing Q M Q.
+    # The normals times the motions vanish, so that constraints may be added as observations without changing Q M Q,
+    # nor the trace of Q times anything that vanishes with the motions.
     factor = cho_factor(scale[:, None] * normal * scale + held @ held.T, lower=True)
     once = cho_solve(factor, scale[:, None] * middle * scale)
     twice = scale[:, None] * cho_solve(factor, once.T) * scale
-    return np.asarray(twice[width:, width:])
+    outside = float(np.trace(cho_solve(factor, scale[:, None] * outer * scale)))
+    return np.asarray(twice[width:, width:]), scale[:, None] * once / scale, outside
+
+
+def _sums_of_squares(
+    normal: Floats, middle: Floats, outer: Floats, through: Floats, outside: float, width: int,
+    of_covariance: tuple[float, float],
+) -> SumsOfSquares:  # fmt: skip
+    """Return mean, variance and covariance of T and V for errors ε of covariance C: quadratic forms of projections.
+
+    V = εᵀ(I - H)ε and T = εᵀ(H - K)ε, H the projection on all unknowns, K on the stations alone. The mean of εᵀPε is
+    tr(PC), the covariance of two of them 2 tr(PCRC); every trace is one of products with Q or with the inverse of the
+    stations' normals.
+
+    Args:
+        middle: AᵀCA.  outer: AᵀC²A.  through: Q AᵀCA.  outside: tr(Q AᵀC²A).  of_covariance: tr(C), tr(C²).
+    """
+    cameras = cho_factor(normal[:width, :width], lower=True)
+    station = cho_solve(cameras, middle[:width])
+    h, k = float(np.trace(through)), float(np.trace(station[:, :width]))
+    h_square, k_square = outside, float(np.trace(cho_solve(cameras, outer[:width, :width])))
+    hh = float((through * through.T).sum())
+    hk = float((through[:, :width] * station.T).sum())
+    kk = float((station[:, :width] * station[:, :width].T).sum())
+    return SumsOfSquares(
+        t_mean=h - k,
+        t_variance=2.0 * (hh - 2.0 * hk + kk),
+        v_mean=of_covariance[0] - h,
+        v_variance=2.0 * (of_covariance[1] - 2.0 * h_square + hh),
+        common=2.0 * ((h_square - k_square) - (hh - hk)),
+    )

@@ -96,16 +96,53 @@ def log_rms_moments(weights: Floats) -> tuple[float, float]:
     return -0.5 * first, 0.5 * float(np.sqrt(max(variance, 0.0)))
 
 
-def chi2_interval(value: float, dof: int, level: float) -> Interval:
-    """Return a mean square ``value`` = chi²/dof with its two-sided interval."""
-    low, high = chi2.ppf([0.5 * (1 - level), 0.5 * (1 + level)], dof) / dof
-    return Interval(value=value, low=float(low), high=float(high), pit=float(chi2.cdf(value * dof, dof)))
+@dataclass(frozen=True, kw_only=True)
+class SumsOfSquares:
+    """Mean and variance of T = dᵀMd and V = vᵀPv where the errors of image points are correlated, and their covariance.
+
+    With independent errors T is chi² (nu) and V chi² (r). Else both are weighted sums of many chi² (1); with hundreds
+    of degrees of freedom the scaled chi² of the same mean and variance is exact enough (F. E. Satterthwaite, 1946).
+    """
+
+    t_mean: float
+    t_variance: float
+    v_mean: float
+    v_variance: float
+    common: float
+
+    @staticmethod
+    def independent(nu: int, r: int) -> "SumsOfSquares":
+        """Return those of independent errors."""
+        return SumsOfSquares(t_mean=nu, t_variance=2.0 * nu, v_mean=r, v_variance=2.0 * r, common=0.0)
+
+    @property
+    def t_dof(self) -> float:
+        """Degrees of freedom of the scaled chi² that stands for T."""
+        return 2.0 * self.t_mean**2 / self.t_variance
+
+    @property
+    def v_dof(self) -> float:
+        """The same for V."""
+        return 2.0 * self.v_mean**2 / self.v_variance
+
+    @property
+    def ratio_dofs(self) -> tuple[float, float]:
+        """Degrees of freedom of the F that stands for T/V, whose logarithm varies less by what both have in common."""
+        apart = 2.0 / self.t_dof + 2.0 / self.v_dof
+        share = apart / (apart - 2.0 * self.common / (self.t_mean * self.v_mean))
+        return self.t_dof * share, self.v_dof * share
 
 
-def f_interval(value: float, dof_above: int, dof_below: int, level: float) -> Interval:
-    """Return a ratio of mean squares with its two-sided interval."""
-    low, high = f.ppf([0.5 * (1 - level), 0.5 * (1 + level)], dof_above, dof_below)
-    return Interval(value=value, low=float(low), high=float(high), pit=float(f.cdf(value, dof_above, dof_below)))
+def chi2_interval(value: float, dof: float, level: float, mean: float = 1.0) -> Interval:
+    """Return a mean square ``value`` = mean chi²/dof with its two-sided interval."""
+    low, high = mean * chi2.ppf([0.5 * (1 - level), 0.5 * (1 + level)], dof) / dof
+    return Interval(value=value, low=float(low), high=float(high), pit=float(chi2.cdf(value / mean * dof, dof)))
+
+
+def f_interval(value: float, dof_above: float, dof_below: float, level: float, mean: float = 1.0) -> Interval:
+    """Return a ratio of mean squares, ``mean`` times an F, with its two-sided interval."""
+    low, high = mean * f.ppf([0.5 * (1 - level), 0.5 * (1 + level)], dof_above, dof_below)
+    return Interval(value=value, low=float(low), high=float(high), pit=float(f.cdf(value / mean, dof_above, dof_below)))
 
 
 def rms_interval(value: float, weights: Floats, level: float) -> Interval:

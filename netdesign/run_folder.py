@@ -13,13 +13,18 @@ def run_folder(resolved: ResolvedStudy, output: Path | None) -> Path:
     Raises:
         InputError: the folder holds the run of another study, or is a file.
     """
-    run = output or Path("runs") / resolved.study.name
+    run = output or Path("runs") / _folder_name(resolved.study.name)
     if run.exists() and not run.is_dir():
         raise InputError(f"{run}: expected a folder, found a file")
     study = run / "study.toml"
     if study.exists() and resolve(study).sha256 != resolved.sha256:
         raise InputError(f"{run}: holds the run of another study or seed; name another folder with -o, or remove it")
     return run
+
+
+def _folder_name(name: str) -> str:
+    """Return the study's name as that of one folder: it must not lead out of runs/."""
+    return "run" if not name.strip(". ") else name.replace("/", "-").replace("\\", "-")
 
 
 def belongs_to_validation(folder: Path) -> bool:

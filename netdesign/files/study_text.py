@@ -67,8 +67,8 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     elif problem["type"] in ("too_long", "too_short"):
         wanted = context.get("max_length", context.get("min_length"))
         return f"{place}: expected a list of {wanted}, found one of {context.get('actual_length')}{more}"
-    elif problem["type"] in ("string_too_short", "string_pattern_mismatch"):
-        message = "text" if problem["type"] == "string_too_short" else "a name without / and \\, not . or .."
+    elif problem["type"] == "string_too_short":
+        message = "text"
     if problem["type"] == "value_error":
         return f"{place}: {message}{more}" if place else f"{message}{more}"
     return f"{place}: expected {message}, found {problem['input']!r}{more}"

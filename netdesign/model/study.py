@@ -247,8 +247,7 @@ class Study(Table):
     """A whole study file."""
 
     format: Literal[1]
-    # It names the run directory, runs/<name>.
-    name: Annotated[str, Field(min_length=1, pattern=r"^[^/\\]*[^/\\.][^/\\]*$")]
+    name: Annotated[str, Field(min_length=1)]
     seed: Annotated[int, Field(ge=0)] = 1
     part: PartTable
     targets: TargetsTable

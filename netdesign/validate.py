@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from netdesign.adjustment.campaign import pool
 from netdesign.cluster import executor_of
 from netdesign.files.adjustment import campaign_member, campaign_payload
@@ -23,6 +25,7 @@ from netdesign.run_folder import open_run
 # Of all deciding intervals of a campaign together; each has Bonferroni's share: right predictions fail anywhere in a
 # whole campaign with a probability of at most one per cent.
 FAMILY_LEVEL = 0.99
+FAR_OFF = 2.0  # times the sigma that the study assumes
 DECIDING = 3  # T, F and rho of every realisation
 POOLED = ("network", "repeat", "verdict", "reasons", "warnings", "predicted_rms_um", "achieved_rms_um", "statistics")
 
@@ -107,8 +110,23 @@ def _pool(task: Task, run: Path, networks: dict[int, PlannedNetwork]) -> Validat
     verdicts: dict[int, str] = {}
     for record in sorted(records, key=lambda record: worst[record["verdict"]]):
         verdicts[record["network"]] = record["verdict"]
-    lines = [_line(record) for record in records] + [statement]
+    lines = [_line(record) for record in records] + [statement] + noise_hint(task, adjusted)
     return ValidationOutcome(verdicts=verdicts, summary="\n".join(lines))
+
+
+def noise_hint(task: Task, records: list[dict[str, Any]]) -> list[str]:
+    """Return that the image points are of quite another quality than the study's sigma_px says, in one line or none."""
+    predicted = [record["predicted_rms_um"] for record in records]
+    ratios = [row["total"] / row["used"] for row in predicted if row["total"] and row["used"]]
+    if task.camera.corner_noise is not None or not ratios:
+        return []
+    ratio = float(np.exp(np.mean(np.log(ratios))))
+    if 1.0 / FAR_OFF < ratio < FAR_OFF:
+        return []
+    return [
+        f"the image points measured here have about {task.camera.sigma_px / ratio:.2g} px where the design assumes "
+        f'camera.sigma_px = {task.camera.sigma_px:g}; camera.noise = "detector" predicts with this detector'
+    ]
 
 
 def _line(record: dict[str, Any]) -> str:

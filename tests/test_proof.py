@@ -9,11 +9,13 @@ from netdesign.adjustment.diagnosis import SHARE_HARDLY_CHECKED, quality_warning
 from netdesign.adjustment.estimate import estimate
 from netdesign.files.design_json import read_networks
 from netdesign.imaging.measure import TagMeasurement
+from netdesign.model.camera import CornerNoise
 from netdesign.model.network import Observations
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.photogrammetry.collinearity import project
 from netdesign.placement.distances import network_total_error
 from netdesign.proof import _adjusted, _as_planned, _intersected
+from netdesign.validate import noise_hint
 from tests.bundle_cases import observe, problem_of, relief
 from tests.runs import convex_visible, ring_run
 
@@ -96,3 +98,13 @@ def test_a_tag_of_one_image_is_left_out_by_name(proved):
     assert [matrix[0, 0] for matrix in covariances] == [0, 1]
     assert alone[0] == f"tag {ids[1]}: measured in 1 image(s), at least 2 needed"
     assert len(alone) == len(ids) - 1
+
+
+@pytest.mark.parametrize(("total", "says"), [(20.0, "0.01 px"), (1.0, "0.2 px"), (2.4, None), (None, None)])
+def test_image_points_far_from_the_assumed_sigma_are_said(tmp_path, total, says):
+    task = ring_run(tmp_path / "run", sizes=(8,))
+    lines = noise_hint(task, [{"predicted_rms_um": {"limited": 1.0, "total": total, "used": 2.0}}])
+    assert len(lines) == (says is not None)
+    assert all(f"have about {says} where the design assumes camera.sigma_px = 0.1" in line for line in lines)
+    detector = replace(task, camera=replace(task.camera, corner_noise=CornerNoise(k=1.0, floor_px=0.0)))
+    assert noise_hint(detector, [{"predicted_rms_um": {"limited": 1.0, "total": 20.0, "used": 2.0}}]) == []

@@ -17,7 +17,7 @@ from netdesign.motion.tour import nearest_neighbour_3opt
 from netdesign.photogrammetry.limited_error import limited_covariance
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.visibility import sightings
-from netdesign.placement.bound import information_limit
+from netdesign.placement.bound import lower_bounds
 from netdesign.placement.encoding import Chromosomes
 from netdesign.placement.finish import finish, spread
 from netdesign.placement.optimal_design import _apportioned
@@ -150,7 +150,7 @@ def test_seeds_reach_the_optimum_of_every_size(plate):
     """A ring is within a few percent of the proven bound; the rounded optimal designs are not worse than rings."""
     bits, genes = plate.seeds()
     objectives, violation = plate.evaluate(bits, genes)
-    limit = information_limit(plate.task, plate.visibility)
+    limit = lower_bounds(plate.task, [1])[1]
     for size in range(3, plate.chromosomes.slots + 1):
         of_size = (objectives[:, 2] == size) & (violation <= 0)
         assert 1 <= objectives[of_size, 0].min() / (limit / size) <= (1.02 if size > 3 else 1.03)

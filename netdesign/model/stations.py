@@ -47,6 +47,31 @@ class Depth:
         leave = np.where(parallel, np.where(inside, np.inf, -np.inf), np.maximum(one, other)).min(axis=-1)
         return np.maximum(enter, 0.0), leave
 
+    def limits_around(self, directions: Floats, chord: Floats) -> tuple[Floats, Floats]:
+        """Return bounds (…) of all distances within the body along the unit vectors within ``chord`` of a direction.
+
+        Args:
+            directions: (…, 3) unit.  chord: (…) largest distance between a unit vector and its direction.
+
+        Along every such vector v and for every admissible r: least <= r <= largest; least > largest: there is none.
+        """
+        if self.shape == "ellipsoid":
+            # |v / a| differs by at most chord / min a; the axes themselves bound it too.
+            lower = np.linalg.norm(directions / self.low, axis=-1) + chord / self.low.min()
+            upper = np.linalg.norm(directions / self.high, axis=-1) - chord / self.high.min()
+            far = np.where(upper > 0.0, 1.0 / np.where(upper > 0.0, upper, 1.0), np.inf)
+            return np.maximum(1.0 / lower, self.low.min()), np.minimum(far, self.high.max())
+        # r v lies in the box: its components are at least r (d - chord) and at most r (d + chord).
+        farthest = float(np.linalg.norm(np.maximum(np.abs(self.low), np.abs(self.high))))
+        near, far = np.zeros(directions.shape[:-1]), np.full(directions.shape[:-1], farthest)
+        for sign, edge in ((1.0, self.low), (-1.0, -self.high)):
+            reach = sign * directions + chord[..., None]  # r · reach >= edge must be possible
+            quotient = edge / np.where(reach == 0.0, 1.0, reach)
+            least = np.where(reach > 0.0, quotient, np.where(edge > 0.0, np.inf, 0.0))
+            largest = np.where((reach < 0.0) & (edge <= 0.0), quotient, np.inf)
+            near, far = np.maximum(near, least.max(axis=-1)), np.minimum(far, largest.min(axis=-1))
+        return near, far
+
 
 @dataclass(frozen=True, kw_only=True)
 class ViewingSphere:

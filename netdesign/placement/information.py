@@ -1,49 +1,58 @@
-"""How much one image can tell at most, over whole cells of the viewing sphere (kernels of ``bound``).
+"""How much one image can tell at most, over whole cells of the admissible stations (kernels of ``bound``).
 
-With u the direction of the camera from the sphere's centre, p an object point relative to it, w = |p|, R the radius,
-d = p - R u and z = R - u·p, an image that looks at the centre adds to the point's normal matrix (any roll)
+With u the direction of the camera from the centre that it looks at, R its distance from there, p an object point
+relative to it, w = |p|, d = p - R u and z = R - u·p, an image adds to the point's normal matrix (any roll)
 
-    M(u) = omega / z⁴ · (|d|² I - d dᵀ - (p x u)(p x u)ᵀ),        omega = (focal · gain / sigma)²
+    M(u, R) = omega / z⁴ · (|d|² I - d dᵀ - (p x u)(p x u)ᵀ),        omega = (focal · gain / sigma)²
 
-For a symmetric Z and Y = Z², tr(Z M Z) = omega · A(u) / z⁴ with the quadratic A(u) = a + b·u + uᵀ C u,
+For a symmetric Z and Y = Z², tr(Z M Z) = omega · A / z⁴ with the quadratic A(u) = a + b·u - uᵀ C u,
 
-    a = (w² + R²) tr Y - pᵀ Y p,    b = 2 R (Y - tr Y) p,    C = -R² Y - [p]ₓᵀ Y [p]ₓ.
+    a = (w² + R²) tr Y - pᵀ Y p,    b = 2 R (Y - tr Y) p,    C = R² Y + K,    K = [p]ₓᵀ Y [p]ₓ.
 
-Along a great circle (|u'| = 1, u'' = -u) the second derivative of A / z⁴ is at most
+Width of a cell: along a great circle (|u'| = 1, u'' = -u) the second derivative of A / z⁴ is at most
 
-    ((|b| + 2 c) + 8 (|b| + c) w / z + tr Y (R + w)² (20 w² / z² + 4 w / z)) / z⁴,   z = R - w,  c = ‖C‖,
+    ((|b| + 2 c) + 8 (|b| + c) w / z + tr Y (R + w)² (20 w² / z² + 4 w / z)) / z⁴,   z the least there,  c = ‖C‖,
 
-so a cell whose viewpoints lie within delta of its middle admits at most value + |gradient| delta + curvature
-delta² / 2, gradients added over the points before the norm is taken. gain and sigma enter by their best in the cell.
+so a cell whose directions lie within delta of its middle admits at most value + |gradient| delta + curvature
+delta² / 2, gradients added over the points before the norm is taken.
+
+Depth of a cell: along a ray, with q the part of p across u and y = uᵀYu, A / z⁴ = (tr Y - y) / z² + 2 qᵀYu / z³ +
+y |q|² / z⁴. As Y is positive, the middle term is at most twice the geometric mean of the other two, and the second
+derivative is at least -1.2 (tr Y - y) / z⁴. So the sum over the points is nowhere on a ray more than at the nearer or
+at the farther end, plus 0.6 e² Σ omega tr Y / z⁴ with e half the depth of the cell.
+
+gain and sigma enter by their best in the cell.
 """
 
 import math
 
 import numpy as np
 
-from netdesign.model.arrays import Bools, Floats, Ints
+from netdesign.model.arrays import Floats
 from netdesign.model.compiled import entry, part
-from netdesign.model.frames import sphere_directions
 from netdesign.placement.visibility_cells import Words
 
 
 @part()
 def weight(
-    z: float, lateral: float, w: float, cosine: float, distance: float, radius: float, delta: float, gains: Floats,
-    sigmas: Floats,
+    lowest: float, depth: float, lateral: float, moved: float, half: float, distance: float, facing: float,
+    travelled: float, gains: Floats, sigmas: Floats,
 ) -> float:  # fmt: skip
-    """Return the largest omega of a point within ``delta`` of a viewpoint.
+    """Return the largest omega of a point over a cell.
 
     Args:
-        z, lateral: depth and distance from the optical axis, m.  cosine: of the incidence.  distance: m.
+        lowest: least depth of the point, m.  depth, lateral: along and from the optical axis, in the middle, m.
+        moved: how far the point moves in the camera's frame, m.  half: e, m.
+        distance, facing: from the camera in the middle, m; the latter along the normal.
+        travelled: how far the camera moves, m.
         gains: (b + 1,) squared gain of the distortion, at most, in equal steps of the radius; last: the step.
         sigmas: (y, x) focal² / sigma², at most, over depth and cosine; last row: lowest depth, step of the depth.
     """
     best = 1.0
-    nearest = z - 2.0 * w * math.sin(0.5 * delta)
     if len(gains) > 2:
-        r = lateral / z
-        shift = 2.0 * w * math.sin(0.5 * delta) * math.sqrt(1.0 + r * r) / max(nearest, 1e-9)
+        r = lateral / depth
+        shift = moved * math.sqrt(1.0 + r * r) / lowest
+        shift += (r + shift) * half / lowest
         bins = len(gains) - 1
         first = min(max(int((r - shift) / gains[bins]), 0), bins - 1)
         last = min(max(int((r + shift) / gains[bins]), 0), bins - 1)
@@ -53,128 +62,115 @@ def weight(
     rows, columns = sigmas.shape[0] - 1, sigmas.shape[1]
     if rows == 1:
         return float(best * sigmas[0, 0])
-    sine = min(2.0 * radius * math.sin(0.5 * delta) / distance, 1.0)
+    sine, cosine = min(travelled / distance, 1.0), facing / distance
     # cos(i - spread), at most 1
     steepest = 1.0
     if cosine < math.sqrt(1.0 - sine * sine):
         steepest = cosine * math.sqrt(1.0 - sine * sine) + math.sqrt(max(1.0 - cosine * cosine, 0.0)) * sine
-    row = min(max(int((nearest - sigmas[rows, 0]) / sigmas[rows, 1]), 0), rows - 1)
+    row = min(max(int((lowest - sigmas[rows, 0]) / sigmas[rows, 1]), 0), rows - 1)
     column = min(max(int(steepest * columns), 0), columns - 1)
     return float(best * sigmas[row, column])
 
 
-def normal_matrices(
-    viewpoints: Floats, visible: Bools, radius: float, points: Floats, normals: Floats, gains: Floats, sigmas: Floats
-) -> Floats:
-    """Return (c, m, 6): xx, xy, xz, yy, yz, zz of M for viewpoints (c, 2), 0 where not visible (c, m).
-
-    Not a bound but the thing itself (up to the steps of the tables): it only guides the choice of Z.
-    """
-    u = sphere_directions(viewpoints)
-    along = u @ points.T
-    offset = points[None] - radius * u[:, None]
-    across = np.cross(points[None], u[:, None])
-    square, lateral = np.einsum("cmi,cmi->cm", offset, offset), np.linalg.norm(across, axis=2)
-    z = radius - along
-    scale = np.where(visible, 1.0 / z**4, 0.0)
-    if len(gains) > 2:
-        bins = len(gains) - 1
-        scale *= gains[np.minimum((lateral / z / gains[bins]).astype(np.int64), bins - 1)]
-    rows, columns = len(sigmas) - 1, sigmas.shape[1]
-    cosine = np.clip(-np.einsum("cmi,mi->cm", offset, normals) / np.sqrt(square), 0.0, 1.0)
-    step = sigmas[rows, 1] if rows > 1 else 1.0
-    row = np.clip((z - sigmas[rows, 0]) / step, 0, rows - 1).astype(np.int64)
-    scale *= sigmas[row, np.minimum((cosine * columns).astype(np.int64), columns - 1)]
-    matrices = np.empty((*scale.shape, 6))
-    for place, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
-        diagonal = square if i == j else 0.0
-        matrices[..., place] = scale * (diagonal - offset[..., i] * offset[..., j] - across[..., i] * across[..., j])
-    return matrices
-
-
 @entry()
-def largest_gains(
-    cells: Ints, grid: Floats, parts: int, spreads: Floats, bits: Words, radius: float, points: Floats, normals: Floats,
-    forms: Floats, gains: Floats, sigmas: Floats,
+def most_information(
+    directions: Floats, depths: Floats, deltas: Floats, bits: Words, points: Floats, normals: Floats, squares: Floats,
+    gains: Floats, sigmas: Floats,
 ) -> Floats:  # fmt: skip
-    """Return (c,) upper bounds of Σ tr(Z_j M_j(u) Z_j) over every viewpoint of each cell.
+    """Return (c, 3): an upper bound of h over every station of each cell, and what its width and its depth add to it.
 
     Args:
-        cells: (c,) of the map with ``grid``.  parts: every cell is cut into parts x parts, each bounded by itself.
-        spreads: (rows, parts) delta of the parts of a row of cells.  bits: (cells, words) of the tags that count.
-        points, normals: (m, 3), points relative to the sphere's centre.
-        forms: (m, 11) a, b, the upper triangle of C, and the curvature of ``quadratic_forms``.
+        directions: (c, 3) unit, to the middle of each cell.  depths: (c, 2) least and largest R, m.
+        deltas: (c,) largest angle of a direction of the cell from its middle, rad.
+        bits: (c, words) of the tags that count.
+        points, normals: (m, 3), points relative to the centre.
+        squares: (m, 21) of ``quadratic_forms``.
         gains, sigmas: as in ``weight``.
     """
-    result = np.zeros(len(cells))
-    columns = int(grid[2])
-    for index in range(len(cells)):
-        cell = cells[index]
-        for piece in range(parts * parts):
-            alpha = grid[0] + (cell % columns + (piece % parts + 0.5) / parts) / grid[1]
-            beta = grid[3] + (cell // columns + (piece // parts + 0.5) / parts) / grid[4]
-            ux, uy, uz = math.cos(beta) * math.cos(alpha), math.cos(beta) * math.sin(alpha), math.sin(beta)
-            delta = spreads[cell // columns, piece // parts]
-            value = curvature = gx = gy = gz = 0.0
-            for tag in range(len(points) // 4):
-                if not (bits[cell, tag >> 6] >> np.uint64(tag & 63)) & np.uint64(1):
+    result = np.zeros((len(directions), 3))
+    for cell in range(len(directions)):
+        ux, uy, uz = directions[cell, 0], directions[cell, 1], directions[cell, 2]
+        near, far, delta = depths[cell, 0], depths[cell, 1], deltas[cell]
+        middle, half, sine = 0.5 * (near + far), 0.5 * (far - near), 2.0 * math.sin(0.5 * delta)
+        ends = 2 if far > near else 1
+        sums = np.zeros((2, 5))  # value, gradient, curvature at either end
+        bend, reached = 0.0, False
+        for tag in range(len(points) // 4):
+            if not (bits[cell, tag >> 6] >> np.uint64(tag & 63)) & np.uint64(1):
+                continue
+            for j in range(4 * tag, 4 * tag + 4):
+                px, py, pz = points[j, 0], points[j, 1], points[j, 2]
+                size, along = squares[j, 0], ux * px + uy * py + uz * pz
+                trace, constant = squares[j, 1], squares[j, 2]
+                gx, gy, gz = squares[j, 3], squares[j, 4], squares[j, 5]
+                lowest = near - along - size * sine
+                if lowest <= 0.0:
+                    reached = True
                     continue
-                for j in range(4 * tag, 4 * tag + 4):
-                    px, py, pz = points[j, 0], points[j, 1], points[j, 2]
-                    up = ux * px + uy * py + uz * pz
-                    z = radius - up
-                    cx = forms[j, 4] * ux + forms[j, 5] * uy + forms[j, 6] * uz
-                    cy = forms[j, 5] * ux + forms[j, 7] * uy + forms[j, 8] * uz
-                    cz = forms[j, 6] * ux + forms[j, 8] * uy + forms[j, 9] * uz
-                    a = forms[j, 0] + forms[j, 1] * ux + forms[j, 2] * uy + forms[j, 3] * uz
-                    a += cx * ux + cy * uy + cz * uz
-                    scale = sigmas[0, 0]
-                    if len(gains) > 2 or len(sigmas) > 2:
-                        square = px * px + py * py + pz * pz
-                        distance = math.sqrt(square + radius * radius - 2.0 * radius * up)
-                        facing = radius * (ux * normals[j, 0] + uy * normals[j, 1] + uz * normals[j, 2])
-                        facing -= px * normals[j, 0] + py * normals[j, 1] + pz * normals[j, 2]
-                        lateral = math.sqrt(max(square - up * up, 0.0))
-                        scale = weight(
-                            z, lateral, math.sqrt(square), facing / distance, distance, radius, delta, gains, sigmas
-                        )
+                scale = sigmas[0, 0]
+                if len(gains) > 2 or len(sigmas) > 2:
+                    scale = weight(
+                        lowest, middle - along, math.sqrt(max(size * size - along * along, 0.0)), size * sine, half,
+                        math.sqrt(size * size + middle * middle - 2.0 * middle * along),
+                        middle * (ux * normals[j, 0] + uy * normals[j, 1] + uz * normals[j, 2])
+                        - (px * normals[j, 0] + py * normals[j, 1] + pz * normals[j, 2]),
+                        middle * sine + half, gains, sigmas,
+                    )  # fmt: skip
+                yx = squares[j, 6] * ux + squares[j, 7] * uy + squares[j, 8] * uz
+                yy = squares[j, 7] * ux + squares[j, 9] * uy + squares[j, 10] * uz
+                yz = squares[j, 8] * ux + squares[j, 10] * uy + squares[j, 11] * uz
+                kx = squares[j, 12] * ux + squares[j, 13] * uy + squares[j, 14] * uz
+                ky = squares[j, 13] * ux + squares[j, 15] * uy + squares[j, 16] * uz
+                kz = squares[j, 14] * ux + squares[j, 16] * uy + squares[j, 17] * uz
+                linear = gx * ux + gy * uy + gz * uz
+                y, k = yx * ux + yy * uy + yz * uz, kx * ux + ky * uy + kz * uz
+                for end in range(ends):
+                    r = near if end == 0 else far
+                    z = r - along
                     inverse = 1.0 / z
-                    scale *= inverse * inverse * inverse * inverse
+                    factor = scale * inverse * inverse * inverse * inverse
+                    a = constant + r * r * (trace - y) + 2.0 * r * linear - k
                     steep = 4.0 * a * inverse
-                    value += scale * a
-                    gx += scale * (forms[j, 1] + 2.0 * cx + steep * px)
-                    gy += scale * (forms[j, 2] + 2.0 * cy + steep * py)
-                    gz += scale * (forms[j, 3] + 2.0 * cz + steep * pz)
-                    curvature += scale * z**4 * forms[j, 10]
-            radial = gx * ux + gy * uy + gz * uz
-            slope = math.sqrt(max(gx * gx + gy * gy + gz * gz - radial * radial, 0.0))
-            result[index] = max(result[index], value + slope * delta + 0.5 * curvature * delta * delta)
+                    sums[end, 0] += factor * a
+                    sums[end, 1] += factor * (2.0 * (r * gx - r * r * yx - kx) + steep * px)
+                    sums[end, 2] += factor * (2.0 * (r * gy - r * r * yy - ky) + steep * py)
+                    sums[end, 3] += factor * (2.0 * (r * gz - r * r * yz - kz) + steep * pz)
+                    inverse = 1.0 / (z - size * sine)
+                    ratio = size * inverse
+                    slope, norm = 2.0 * r * squares[j, 18], r * r * squares[j, 19] + squares[j, 20]
+                    sums[end, 4] += scale * inverse * inverse * inverse * inverse * (
+                        slope + 2.0 * norm + 8.0 * (slope + norm) * ratio
+                        + trace * (r + size) ** 2 * (20.0 * ratio * ratio + 4.0 * ratio)
+                    )  # fmt: skip
+                inverse = 1.0 / lowest
+                bend += scale * trace * inverse * inverse * inverse * inverse
+        bend *= 0.6 * half * half
+        highest, width = 0.0, 0.0
+        for end in range(ends):
+            radial = sums[end, 1] * ux + sums[end, 2] * uy + sums[end, 3] * uz
+            slope = sums[end, 1] ** 2 + sums[end, 2] ** 2 + sums[end, 3] ** 2 - radial * radial
+            added = math.sqrt(max(slope, 0.0)) * delta + 0.5 * sums[end, 4] * delta * delta
+            highest, width = max(highest, sums[end, 0] + added), max(width, added)
+        result[cell, 0], result[cell, 1], result[cell, 2] = highest + bend, width, bend
+        if reached:  # the cell's stations come too near for a bound
+            result[cell, 0] = np.inf
     return result
 
 
-def quadratic_forms(squares: Floats, points: Floats, radius: float) -> Floats:
-    """Return (m, 11): a, b (3), C as xx xy xz yy yz zz, and the bound on the second derivative, per point.
+def quadratic_forms(squares: Floats, points: Floats) -> Floats:
+    """Return (m, 21): w; tr Y; w² tr Y - pᵀYp; (Y - tr Y) p; Y and K as xx xy xz yy yz zz; the norms of the last three.
 
     Args:
-        squares: (m, 3, 3) Y = Z².  points: (m, 3) relative to the sphere's centre.
+        squares: (m, 3, 3) Y = Z².  points: (m, 3) relative to the centre.
     """
-    trace = np.trace(squares, axis1=1, axis2=2)
-    size = np.linalg.norm(points, axis=1)
+    trace, size = np.trace(squares, axis1=1, axis2=2), np.linalg.norm(points, axis=1)
     image = np.einsum("mij,mj->mi", squares, points)
-    constant = trace * (size**2 + radius**2) - np.einsum("mi,mi->m", points, image)
-    linear = 2.0 * radius * (image - trace[:, None] * points)
+    linear = image - trace[:, None] * points
     # Columns of [p]ₓ are p x e_k, so that p x u = [p]ₓ u.
     cross = np.cross(points[:, None, :], np.eye(3)[None]).swapaxes(1, 2)
-    quadratic = -(radius**2) * squares - np.einsum("mki,mkl,mlj->mij", cross, squares, cross)
-    norm = np.linalg.norm(quadratic, axis=(1, 2), ord=2) if len(points) else np.zeros(0)
-    depth = radius - size
-    ratio = size / depth
-    slope = np.linalg.norm(linear, axis=1)
-    curvature = (
-        slope
-        + 2.0 * norm
-        + 8.0 * (slope + norm) * ratio
-        + trace * (radius + size) ** 2 * (20.0 * ratio**2 + 4.0 * ratio)
-    ) / depth**4
-    upper = quadratic[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    return np.ascontiguousarray(np.column_stack([constant, linear, upper, curvature]))
+    turned = np.einsum("mki,mkl,mlj->mij", cross, squares, cross)
+    upper = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+    columns = [size, trace, trace * size**2 - np.einsum("mi,mi->m", points, image), linear, squares[:, *upper]]
+    columns += [turned[:, *upper], np.linalg.norm(linear, axis=1)]
+    columns += [np.linalg.norm(matrices, axis=(1, 2), ord=2) for matrices in (squares, turned)]
+    return np.ascontiguousarray(np.column_stack(columns))

@@ -69,7 +69,7 @@ def information_of(task: Task, world_from_cam: Floats, visible: Bools) -> Floats
         for place, (row, column) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
             found[image, :, place] = whitened[:, 0, row] * whitened[:, 0, column]
             found[image, :, place] += whitened[:, 1, row] * whitened[:, 1, column]
-    return found.reshape(len(found), -1)
+    return found.reshape(len(found), 6 * len(points))
 
 
 def rounded_networks(candidates: Floats, flat: Floats, sizes: Iterable[int], score: Score) -> list[Floats]:

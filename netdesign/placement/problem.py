@@ -153,7 +153,7 @@ class Problem(NetworkProblem):
 
     def bounds(self, sizes: Iterable[int]) -> dict[int, float]:
         """Return proven lower bounds on f1 by number of images; empty where nothing is proved."""
-        return lower_bounds(self.task, sizes, self.visibility)
+        return lower_bounds(self.task, sizes)
 
     def without_tour_limit(self) -> "Problem":
         """Return the problem without requirements.max_tour; itself when there is none."""

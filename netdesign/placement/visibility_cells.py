@@ -12,6 +12,9 @@ from the sphere's centre and R the radius:
   most rho sqrt(1 + q²) / z, z its least depth; distortion stretches that by at most its largest gain;
 * an edge of length s changes in normalised coordinates by at most kappa·delta S s / z (1 + 2 w / z), S² = 1 + q²:
   the derivatives of its two ends, subtracted before they are bounded.
+
+A cell may also be deep: its stations then stand within e of R from the centre, camera positions and depths change by e
+more, an image point by at most q e / z more (q' = -q / z) and an edge by at most (1 + q) e / z of itself.
 """
 
 import math
@@ -33,17 +36,18 @@ Mesh = tuple[Floats, Ints, Floats, Ints, Ints, Ints]
 
 @part()
 def classify(
-    pose: Floats, radius: float, delta: float, turn: float, points: Floats, away: Floats, normal: Floats,
-    settings: Floats, field: Floats, tag_size: float,
+    pose: Floats, radius: float, half_depth: float, delta: float, turn: float, points: Floats, away: Floats,
+    normal: Floats, settings: Floats, field: Floats, tag_size: float,
 ) -> int:  # fmt: skip
     """Return HIDDEN, UNDECIDED or VISIBLE, but for occlusion, of one tag from every viewpoint of a cell.
 
     Args:
-        pose: (4, 4) world_from_cam in the middle of the cell.  radius: R.  delta: rad.  turn: kappa·delta, rad.
+        pose: (4, 4) world_from_cam in the middle of the cell.  radius: R.  half_depth: e, m.  delta: rad.
+        turn: kappa·delta, rad.
         points: (5, 3) of the tag.  away: (5,) their distances from the sphere's centre.  normal: (3,).
         settings: of ``visibility.sight_settings``.  field: of ``visibility_map.field_bounds``.
     """
-    moved = 2.0 * radius * math.sin(0.5 * delta)
+    moved = 2.0 * radius * math.sin(0.5 * delta) + half_depth
     sin_limit = math.sqrt(max(1.0 - settings[12] ** 2, 0.0))
     everywhere = True
     nearest, widest, farthest_out = np.inf, 0.0, 0.0
@@ -51,7 +55,7 @@ def classify(
     for k in range(4):
         dx, dy, dz = points[k, 0] - pose[0, 3], points[k, 1] - pose[1, 3], points[k, 2] - pose[2, 3]
         z = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
-        depth_change = 2.0 * away[k] * math.sin(0.5 * delta)
+        depth_change = 2.0 * away[k] * math.sin(0.5 * delta) + half_depth
         if z + depth_change <= 0.0 or z + depth_change < settings[14] or z - depth_change > settings[15]:
             return HIDDEN
         if z - depth_change < settings[14] or z + depth_change > settings[15]:
@@ -73,16 +77,20 @@ def classify(
         farthest_out = max(farthest_out, away[k])
     # The worst of the four corners stands for all of them.
     stretch = math.sqrt(1.0 + widest)
-    shift = 2.0 * farthest_out * math.sin(0.5 * min(turn, np.pi)) * stretch / nearest
+    turned = 2.0 * farthest_out * math.sin(0.5 * min(turn, np.pi)) * stretch / nearest
+    approach = half_depth / nearest
+    shift = turned + (math.sqrt(widest) + turned) * approach
     reach = field[1] + shift
     square = reach * reach
     tangential = abs(settings[6]) + abs(settings[7])
     bend = 3.0 * abs(settings[4]) * square + 5.0 * abs(settings[5]) * square * square + 6.4 * tangential * reach
     curve = 6.0 * abs(settings[4]) * reach + 20.0 * abs(settings[5]) * reach * square + 6.4 * tangential
     focal_high, focal_low = max(settings[0], settings[1]), min(settings[0], settings[1])
-    stretch = math.sqrt(1.0 + (math.sqrt(widest) + shift) ** 2)
+    aside = math.sqrt(widest) + shift
+    stretch = math.sqrt(1.0 + aside**2)
     edge = stretch * tag_size / nearest
-    edge_change = turn * edge * (1.0 + 2.0 * farthest_out / nearest)
+    edge_change = turn * edge * (1.0 + 2.0 * farthest_out / nearest) + (1.0 + aside) * approach * edge
+    drift = turn * stretch * farthest_out / nearest + aside * approach
     shortest_low, shortest_high = np.inf, np.inf
     free_roll = field[2] > 0.0
     margin = focal_high * (1.0 + bend) * shift + 1e-9
@@ -112,7 +120,7 @@ def classify(
             return HIDDEN
         if low < margin or high > -margin or (r + shift) ** 2 > settings[17]:
             everywhere = False
-        change = focal_high * ((1.0 + bend) * edge_change + curve * edge * turn * stretch * farthest_out / nearest)
+        change = focal_high * ((1.0 + bend) * edge_change + curve * edge * drift)
         if k == 0:
             first_u, first_v = u, v
         else:
@@ -191,7 +199,7 @@ def fill(
             if not waiting[block, g]:
                 continue
             state = classify(
-                poses[block], radius, delta, turn, points[g], away[g], normals[g], settings, field, tag_size
+                poses[block], radius, 0.0, delta, turn, points[g], away[g], normals[g], settings, field, tag_size
             )
             if mesh is not None and shadowed[g] and (state == VISIBLE or (state == UNDECIDED and size == 1)):
                 spread = 2.0 * radius * math.sin(0.5 * delta)
@@ -203,3 +211,34 @@ def fill(
             for row in range(first_row, min(first_row + size, shape[0])):
                 for column in range(first_column, min(first_column + size, shape[1])):
                     bits[row * shape[1] + column, g >> 6] |= np.uint64(1) << np.uint64(g & 63)
+
+
+@entry()
+def settle(
+    poses: Floats, radii: Floats, half_depths: Floats, angles: Floats, points: Floats, away: Floats, normals: Floats,
+    shadowed: Bools, settings: Floats, field: Floats, tag_size: float, mesh: Mesh | None, sure: Words, maybe: Words,
+) -> None:  # fmt: skip
+    """Decide, as far as the size of each cell allows, the tags that may be seen from it.
+
+    Args:
+        poses: (c, 4, 4) in the middle of each cell.  radii, half_depths: (c,) m.  angles: (c, 2) delta, kappa·delta.
+        sure, maybe: (c, words), changed in place: only bits of ``maybe`` are looked at.
+        Others: as in ``fill``.
+    """
+    for cell in range(len(poses)):
+        delta, turn = angles[cell, 0], angles[cell, 1]
+        for g in range(len(points)):
+            bit = np.uint64(1) << np.uint64(g & 63)
+            if not maybe[cell, g >> 6] & bit:
+                continue
+            state = classify(
+                poses[cell], radii[cell], half_depths[cell], delta, turn, points[g], away[g], normals[g], settings,
+                field, tag_size,
+            )  # fmt: skip
+            if mesh is not None and shadowed[g] and state != HIDDEN:
+                spread = 2.0 * radii[cell] * math.sin(0.5 * delta) + half_depths[cell]
+                state = shadow(state, poses[cell], spread, points[g], normals[g], settings, mesh)
+            if state != UNDECIDED:
+                maybe[cell, g >> 6] ^= bit
+            if state == VISIBLE:
+                sure[cell, g >> 6] |= bit

@@ -110,13 +110,13 @@ class Certificate:
         self.cells = self.space.first()
 
     def proof(self, count: int) -> Proof | None:
-        """Return T, F and H of a good choice of Z for ``count`` images beside the existing ones; None: none is known."""
+        """Return what a good choice of Z proves for ``count`` images beside the existing ones; None: nothing."""
         share = self.fixed / max(count, 1)
         if not (_traces(self.flat + share) > 0.0).any(axis=0).all():
             return None
         if not count:
             alone = (self.fixed[None], np.ones(1))
-            return self._proof(*alone, 0.0) if (_traces(alone[0]) > 0.0).all() else None
+            return self._proof(*alone, np.inf) if (_traces(alone[0]) > 0.0).all() else None
         flat, weights = self.flat, np.full(len(self.flat), 1.0 / len(self.flat))
         best: Proof | None = None
         stalled = 0
@@ -182,24 +182,29 @@ class Certificate:
         _, first = np.unique(np.round(place), axis=0, return_index=True)
         cells = cells.take(np.sort(first)[:NEW])
         near, far = cells.depths.T
+        there = np.ones(len(cells), np.bool_)
         if self.task.sphere.depth is not None:
             least, largest = self.task.sphere.depth.limits(cells.directions)
-            near, far = np.maximum(near, least), np.minimum(far, largest)
-        there = near <= far
+            there = least <= largest
+            near, far = (np.minimum(np.maximum(distance, least), largest) for distance in (near, far))
         offsets = [cells.directions[there] * distance[there, None] for distance in (near, 0.5 * (near + far), far)]
         return self._matrices(np.concatenate(offsets if self.task.sphere.depth else offsets[:1]))
 
     def _sampled(self) -> Floats:
         """(c, 6 m) of stations all over the admissible set, more of them for tags that few of these see."""
         sphere = self.task.sphere
+        surface = sphere.depth is not None and not sphere.depth.has_width  # ``sample`` doubles the step of a depth
         offsets = [
             sphere_directions(viewpoints) * sphere.radii(viewpoints)[:, None]
-            for viewpoints in (sphere.sample(step)[0] for step in (CANDIDATE_STEP, FINER_STEP))
+            for viewpoints in (
+                sphere.sample(0.5 * step if surface else step)[0] for step in (CANDIDATE_STEP, FINER_STEP)
+            )
         ]
         flat = self._matrices(offsets[0])
         shy = ((_traces(flat) > 0.0).sum(axis=0) < SHY) & ~(_traces(self.fixed[None])[0] > 0.0)
         if shy.any():
             tags = shy[::CORNERS_PER_TAG]
+            offsets[1] = offsets[1][np.linalg.norm(offsets[1], axis=1) > 0.0]
             poses = look_at(sphere.centre + offsets[1], sphere.centre, sphere.roll or 0.0)
             sees = np.flatnonzero(self.sight.look(poses).visible_tags[:, tags].any(axis=1))
             rows = np.linspace(0, len(sees) - 1, min(len(sees), SHY * int(tags.sum()))).astype(int)
@@ -209,6 +214,7 @@ class Certificate:
     def _matrices(self, offsets: Floats) -> Floats:
         """(c, 6 m) normal matrices of stations at ``offsets`` (c, 3) from the centre; a free roll sees the most."""
         centre, roll = self.task.sphere.centre, self.task.sphere.roll
+        offsets = offsets[np.linalg.norm(offsets, axis=1) > 0.0]  # a box may hold the centre itself
         rolls = np.arange(6) * np.pi / 6 if roll is None else np.array([roll])
         poses = [look_at(centre + offsets, centre, angle) for angle in rolls]
         visible = np.any([self.sight.look(turned).visible for turned in poses], axis=0)
@@ -277,5 +283,3 @@ def _sigma_table(camera: Camera, tag_size: float, near: float, far: float, reach
     last = np.zeros((1, 256))
     last[0, :2] = lowest, step
     return np.ascontiguousarray(np.concatenate([focal**2 / sigma**2, last]))
-
-

@@ -108,12 +108,20 @@ def test_stations_are_the_same_from_every_format(tmp_path):
     np.testing.assert_allclose(np.linalg.norm(of_run[:, :3, 3], axis=1), 0.6)
 
 
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_stations_of_a_spreadsheet(tmp_path, end):
+    lines = ["\ufeffx_mm;y_mm;z_mm;qx;qy;qz;qw;name", "# measured", "1;2;600;1;0;0;0;top", "0;0;500;1;0;0;0;low", ""]
+    (tmp_path / "a.csv").write_bytes(end.join(lines).encode())
+    poses = parse_stations(stations_table("a.csv", tmp_path), tmp_path / "a.csv")
+    np.testing.assert_allclose(poses[:, :3, 3], [[0.001, 0.002, 0.6], [0, 0, 0.5]], atol=1e-15)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
         ("a.csv", "x_mm,y_mm\n1,2\n", "found no z_mm"),
         ("a.csv", "x_mm,y_mm,z_mm,qx,qy,qz,qw\n", "at least one station"),
-        ("a.csv", "x_mm,y_mm,z_mm,qx,qy,qz,qw\n1,2,b,0,0,0,1\n", "a.csv:2: z_mm: expected a number, found 'b'"),
+        ("a.csv", "x_mm,y_mm,z_mm,qx,qy,qz,qw\n1,2,b,0,0,0,1\n", "a.csv:2: z_mm: expected a finite number, found 'b'"),
         ("a.csv", "x_mm,y_mm,z_mm,qx,qy,qz,qw\n1,2,3,0,0,0,0\n", "unit quaternion"),
         ("images.txt", "1 1 0 0 0 1 2\n\n", "IMAGE_ID, qw"),
         ("images.txt", "# nothing\n", "at least one image"),

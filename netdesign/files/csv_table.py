@@ -27,8 +27,19 @@ def csv_rows(path: Path, required: Sequence[str], instead: Sequence[str] = ()) -
         raise InputError(f"{path}: expected a file, found a folder") from None
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: expected UTF-8 text, found {error.reason} at byte {error.start}") from None
+    return table_rows(text, path, required, instead)
+
+
+def table_rows(
+    text: str, path: Path, required: Sequence[str], instead: Sequence[str] = ()
+) -> list[tuple[str, dict[str, str]]]:
+    """Return the same of the text of a table; ``path`` is for messages.
+
+    Raises:
+        InputError: a column is missing, or a row has too few or too many values.
+    """
     # Comments become empty lines, which csv passes over: the line numbers stay right.
-    lines = ["" if line.lstrip().startswith("#") else line for line in text.split("\n")]
+    lines = ["" if line.lstrip().startswith("#") else line for line in _lines(text)]
     header = next((number for number, line in enumerate(lines) if line.strip()), 0)
     delimiter = next((mark for mark in ",;\t" if mark in lines[header]), ",")
     reader = csv.DictReader(io.StringIO("\n".join(lines[header:])), skipinitialspace=True, delimiter=delimiter)
@@ -45,6 +56,10 @@ def csv_rows(path: Path, required: Sequence[str], instead: Sequence[str] = ()) -
             raise InputError(f"{where}: expected {len(names)} values, found another number of them")
         rows.append((where, {name: value.strip() for name, value in row.items()}))
     return rows
+
+
+def _lines(text: str) -> list[str]:
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
 def numbers(where: str, row: dict[str, str], names: Sequence[str]) -> list[float]:

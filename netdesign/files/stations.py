@@ -5,7 +5,6 @@ that table, and running again from it gives the same bytes.
 """
 
 import csv
-import io
 import json
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from netdesign.errors import InputError
 from netdesign.files.colmap_text import read_images
+from netdesign.files.csv_table import numbers, table_rows
 from netdesign.files.packages import resolve_path
 from netdesign.files.robot_program import stations_csv
 from netdesign.files.store import read_json
@@ -59,21 +59,12 @@ def parse_stations(content: bytes, path: Path) -> Floats:
         InputError: not a table, a column is missing, or a number cannot be read.
     """
     try:
-        rows = list(csv.DictReader(io.StringIO(content.decode("utf-8-sig"))))
+        rows = table_rows(content.decode("utf-8-sig"), path, COLUMNS)
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: expected a table of stations (CSV), found {error}") from None
     if not rows:
         raise InputError(f"{path}: expected at least one station, found none")
-    missing = [column for column in COLUMNS if column not in rows[0]]
-    if missing:
-        raise InputError(f"{path}: expected the columns {', '.join(COLUMNS)}, found no {missing[0]}")
-    values = np.zeros((len(rows), len(COLUMNS)))
-    for number, row in enumerate(rows):
-        for place, column in enumerate(COLUMNS):
-            try:
-                values[number, place] = float(row[column])
-            except (TypeError, ValueError):
-                raise InputError(f"{path}:{number + 2}: {column}: expected a number, found {row[column]!r}") from None
+    values = np.array([numbers(where, row, COLUMNS) for where, row in rows])
     return _poses(values[:, :3], values[:, 3:], path)
 
 

@@ -37,7 +37,7 @@ from netdesign.placement.preparation import (
 from netdesign.placement.visibility_map import VisibilityMap
 from netdesign.search.population import Population
 
-CHUNK = 32  # networks per task of the thread pool
+LEAST_CHUNK, CHUNKS = 32, 3  # networks per task of the thread pool, tasks per thread
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,8 +99,10 @@ class Problem(NetworkProblem):
         bits, genes = self._with_pinned(bits, genes)
         objectives, violation = np.empty((len(bits), 3)), np.empty(len(bits))
 
+        step = self._step(len(bits))
+
         def part(start: int) -> None:
-            rows = slice(start, start + CHUNK)
+            rows = slice(start, start + step)
             evaluate_networks(bits[rows], genes[rows], self.tables, objectives[rows], violation[rows])
             if self.joint is None:
                 tables = self.tables
@@ -108,7 +110,7 @@ class Problem(NetworkProblem):
                     bits[rows], genes[rows], tables.radius, tables.longest, objectives[rows], violation[rows]
                 )
 
-        self._share_out(part, range(0, len(bits), CHUNK))
+        self._share_out(part, range(0, len(bits), step))
         self._drive(bits, genes, objectives, violation)
         self.propagate_further(own_bits, own_genes, objectives, violation)
         return objectives, violation
@@ -117,12 +119,17 @@ class Problem(NetworkProblem):
         """Put in what the kernels leave out: tours in joints."""
         joint = self.joint
         if joint is not None:
+            step = self._step(len(bits))
 
             def part(start: int) -> None:
-                rows = slice(start, start + CHUNK)
+                rows = slice(start, start + step)
                 joint_tours(bits[rows], genes[rows], joint, objectives[rows], violation[rows])
 
-            self._share_out(part, range(0, len(bits), CHUNK))
+            self._share_out(part, range(0, len(bits), step))
+
+    def _step(self, count: int) -> int:
+        """Networks per call of a kernel: a call takes as long as two networks, a thread needs several to even out."""
+        return max(1, count if self.threads == 1 else max(LEAST_CHUNK, -(-count // (CHUNKS * self.threads))))
 
     def _share_out(self, part: Callable[[int], None], starts: range) -> None:
         """Call ``part`` for every start, on all threads; parts must not share anything they write."""

@@ -55,20 +55,18 @@ def staircases(objectives: Floats, epsilon: float) -> Ints:
     """
     if len(objectives) == 0:
         return np.zeros(0, dtype=np.int64)
-    logs = np.log(np.maximum(objectives[:, :2], 1e-300))
     order = np.lexsort((objectives[:, 1], objectives[:, 0], objectives[:, 2]))
-    size, second = objectives[order, 2], objectives[order, 1]
-    starts, ends = first_of_runs(size)
-    layer = np.cumsum(starts) - 1
+    layer = np.cumsum(first_of_runs(objectives[order, 2])[0]) - 1
+    # Ranks that no value of an earlier layer falls below: one running minimum serves all layers.
+    second = np.unique(objectives[order, 1], return_inverse=True)[1] - len(order) * layer
     keep = np.ones(len(order), dtype=np.bool_)
-    for first, last in zip(np.flatnonzero(starts).tolist(), np.flatnonzero(ends).tolist(), strict=True):
-        lowest = np.minimum.accumulate(second[first : last + 1])
-        keep[first + 1 : last + 1] = second[first + 1 : last + 1] < lowest[:-1]
+    keep[1:] = second[1:] < np.minimum.accumulate(second)[:-1]
     order, layer = order[keep], layer[keep]
     if epsilon <= 0:
         return order
-    boxes = np.floor(logs[order] / np.log1p(epsilon)).astype(np.int64)
-    nearness = logs[order].sum(axis=1)
+    logs = np.log(np.maximum(objectives[order, :2], 1e-300))
+    boxes = np.floor(logs / np.log1p(epsilon)).astype(np.int64)
+    nearness = logs.sum(axis=1)
     starts, ends = first_of_runs(layer)
     chosen = starts | ends
     starts[1:] |= (boxes[1:, 0] != boxes[:-1, 0]) | (boxes[1:, 1] != boxes[:-1, 1])

@@ -131,9 +131,10 @@ def _fingerprints(bits: Bools, genes: Floats) -> NDArray[np.uint64]:
     """A hash (P,) of 64 bits per chromosome: equal for equal ones, and by chance never for others."""
     words = np.ascontiguousarray(genes).reshape(len(genes), -1).view(np.uint64)
     words = words ^ (words >> np.uint64(32))  # what differs in the high bits only would be multiplied out of the word
-    factors = _factors(words.shape[1] + bits.shape[1])
-    words *= factors[bits.shape[1] :]
-    return np.asarray(words.sum(axis=1) + np.where(bits, factors[: bits.shape[1]], np.uint64(0)).sum(axis=1))
+    slots = bits.shape[1]
+    factors = _factors(words.shape[1] + slots)
+    hashed = np.einsum("pv,v->p", words, factors[slots:])
+    return np.asarray(hashed + np.einsum("pn,n->p", bits.astype(np.uint64), factors[:slots]))
 
 
 @lru_cache

@@ -36,20 +36,22 @@ def first_of_runs(sorted_values: NDArray[Any]) -> tuple[Bools, Bools]:
 
 def crowding(objectives: Floats, ranks: Ints) -> Floats:
     """Return the crowding distance (P,) of every row within its front; inf at the ends of each objective."""
-    count = len(objectives)
-    distance = np.zeros(count)
+    count, criteria = objectives.shape
+    if count == 0:
+        return np.zeros(0)
+    rows, values = np.arange(criteria)[:, None], objectives.T
+    order = np.argsort(values, axis=1, kind="stable")
     short = ranks.astype(np.uint16) if count < 1 << 16 else ranks  # sorted by radix
-    for values in objectives.T:
-        order = np.argsort(values, kind="stable")
-        order = order[np.argsort(short[order], kind="stable")]
-        ordered, front = values[order], ranks[order]
-        starts, ends = first_of_runs(front)
-        extent = (ordered[np.flatnonzero(ends)] - ordered[np.flatnonzero(starts)])[np.cumsum(starts) - 1]
-        gap = np.zeros(count)
-        gap[1:-1] = ordered[2:] - ordered[:-2]
-        step = np.where(extent > 0, gap / np.where(extent > 0, extent, 1.0), 0.0)
-        distance[order] += np.where(starts | ends, np.inf, step)
-    return distance
+    order = order[rows, np.argsort(short[order], axis=1, kind="stable")]
+    ordered = values[rows, order]
+    starts, ends = first_of_runs(ranks[order[0]])  # the fronts lie alike for every objective
+    extent = (ordered[:, ends] - ordered[:, starts])[:, np.cumsum(starts) - 1]
+    step = np.zeros((criteria, count))
+    np.divide(ordered[:, 2:] - ordered[:, :-2], extent[:, 1:-1], out=step[:, 1:-1], where=extent[:, 1:-1] > 0)
+    step[:, starts | ends] = np.inf
+    distance = np.empty((criteria, count))
+    distance[rows, order] = step
+    return np.asarray(distance.sum(axis=0))
 
 
 def ranked(population: Population) -> tuple[Ints, Floats]:

@@ -79,7 +79,7 @@ def _searched(task: Task, problem: NetworkProblem, checkpoint: Path, resume: boo
     def on_step(state: State) -> None:
         nonlocal latest, last_saved
         latest = state
-        done = min(int(state.evaluations[-1]), budget)
+        done = min(state.spent, budget)
         progress("search", done, budget, f"hypervolume {state.hypervolume[-1]:.4f}")
         if time.monotonic() - last_saved > SECONDS_BETWEEN_CHECKPOINTS:
             save_state(checkpoint, state, task.sha256)

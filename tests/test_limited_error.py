@@ -9,11 +9,14 @@ from netdesign.model.compiled import entry
 from netdesign.model.frames import exp_rotation, look_at, pose, sphere_directions
 from netdesign.photogrammetry.limited_error import (
     LANES,
-    add_four_cameras,
+    ROWS,
+    VARIANCES,
+    WEIGHT,
+    add_camera,
+    block_variances,
     blocked,
     direct_covariance,
     limited_covariance,
-    variances_from_moments,
 )
 from tests.scenes import CAMERA, box_scene, ring
 
@@ -28,21 +31,26 @@ def stations(count, seed, distance=0.6):
     return viewpoints, look_at(distance * sphere_directions(viewpoints), np.zeros(3), rng.uniform(-3, 3, count))
 
 
-ADD_FOUR, VARIANCES = entry()(add_four_cameras), entry()(variances_from_moments)
+ADD, FINISH = entry()(add_camera), entry()(block_variances)
 
 
 def moment_variances(viewpoints, points, visible, radius, focal, sigma):
     """(m, 3) by the moment form."""
-    flat, count = blocked(points.T), len(points)
-    moments, variances = np.zeros(3 * len(flat)), np.zeros(len(flat))
-    filled = -len(viewpoints) % 4
-    directions = np.concatenate([sphere_directions(viewpoints), np.tile([0.0, 0, 1], (filled, 1))])
-    weights = np.concatenate([visible / sigma**2, np.zeros((filled, count))])
-    for first in range(0, len(directions), 4):
-        rows = slice(first, first + 4)
-        ADD_FOUR(moments, flat, directions[rows], blocked(weights[rows]), radius)
-    weak = VARIANCES(moments, flat, radius, count, variances)
-    return variances.reshape(-1, 3, LANES).transpose(0, 2, 1).reshape(-1, 3)[:count] / focal**2, weak
+    places, weights = blocked(points.T).reshape(-1, 3 * LANES), blocked(visible / sigma**2)
+    weights = weights.reshape(len(places), len(viewpoints), LANES)
+    found, weak = np.zeros((len(places) * LANES, 3)), 0
+    for index in range(len(places)):
+        block = np.zeros(ROWS * LANES)
+        block[: 3 * LANES] = places[index]
+        for direction, weight in zip(sphere_directions(viewpoints), weights[index], strict=True):
+            block[WEIGHT * LANES : (WEIGHT + 1) * LANES] = weight
+            ADD(block, *direction, radius, 1.0)
+        total, lost = FINISH(block, radius, len(points) - index * LANES)
+        weak += lost
+        variances = block[VARIANCES * LANES : (VARIANCES + 3) * LANES]
+        np.testing.assert_allclose(total, variances.sum(), rtol=1e-12)
+        found[index * LANES : (index + 1) * LANES] = variances.reshape(3, LANES).T
+    return found[: len(points)] / focal**2, weak
 
 
 @given(st.integers(3, 20), st.integers(0, 10**6), st.floats(0.5, 1.0), st.booleans())

@@ -51,12 +51,16 @@ def entry(*, fastmath: frozenset[str] | bool = False, nogil: bool = False) -> Ca
     return decorate
 
 
-def part(*, fastmath: frozenset[str] | bool = False) -> Callable[[Function], Any]:
-    """Return a decorator of functions that kernels call."""
+def part(*, fastmath: frozenset[str] | bool = False, allocates: bool = True) -> Callable[[Function], Any]:
+    """Return a decorator of functions that kernels call.
+
+    One that ``allocates`` no array need not count references, which in the innermost loops takes longer than the work.
+    """
 
     def decorate(function: Function) -> Any:
         _sources[function] = _dependencies(function)
-        register = register_jitable(pipeline_class=_PartCompiler, fastmath=_flags(fastmath), **_OPTIONS)
+        options = _OPTIONS if allocates else {**_OPTIONS, "_nrt": False}
+        register = register_jitable(pipeline_class=_PartCompiler, fastmath=_flags(fastmath), **options)
         return register(function)
 
     return decorate

@@ -25,7 +25,7 @@ from netdesign.model.compiled import FAST, entry, part
 from netdesign.motion.cell import ArmCell
 from netdesign.motion.joint_lookup import LANES, MapArrays, options_of
 from netdesign.motion.robot import Chain
-from netdesign.motion.tour import _improve
+from netdesign.motion.three_opt import improve
 
 NO_TURN = 1e9
 _ROUNDS = 1  # more rounds shorten the tours by 0.3 % on average and cost half as much again
@@ -121,7 +121,7 @@ def work_for(n: int, r: int, most: int) -> Work:
     wide = (max(n, most) + LANES - 1) // LANES * LANES
     return Work(
         np.zeros((2, wide)), np.zeros((max(n, 2), wide, wide)), np.zeros((n + 1, wide), dtype=np.int64),
-        np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 2)), np.zeros((1, r, wide)), np.zeros(1, dtype=np.int64),
+        np.zeros((n + 1, n + 1)), np.zeros((n + 2, n + 2)), np.zeros((1, r, wide)), np.zeros(1, dtype=np.int64),
         np.array([0, 1, 1]), np.zeros(n, dtype=np.int64), np.zeros(n + 1, dtype=np.int64),
     )  # fmt: skip
 
@@ -202,7 +202,7 @@ def joint_tour(options, count, label, barred, law, timed, tour, rounds, work):  
         if turn == rounds or n < 3:
             break
         _chosen_distances(options, label, barred, work.choice, law, timed, work)
-        if _improve(work.distances, trial, work.pairs) > best * (1.0 - 1e-9):
+        if improve(work.distances, trial, work.pairs) > best * (1.0 - 1e-9):
             break
     return best
 

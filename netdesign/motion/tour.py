@@ -4,19 +4,18 @@ An open path is a closed tour with one more node, the dummy, at distance zero fr
 dummy are the free ends. In the search every network gets nearest neighbour and 3-opt, the source paper's heuristic;
 what is reported gets :func:`open_path`, exact up to twelve stations.
 
-Kernels: D (N, N) distances with the dummy as node 0, N = n + 1; t (N,) the closed tour, t[0] = 0;
-P[x, y] = D[t[x], t[y]] the distances in tour order.
+Kernels: D, t and P as in :mod:`netdesign.motion.three_opt`, with the dummy as node 0, N = n + 1.
 """
 
 import numpy as np
 
 from netdesign.errors import InputError
 from netdesign.model.arrays import Floats, Ints
-from netdesign.model.compiled import FAST, entry, part
+from netdesign.model.compiled import entry, part
+from netdesign.motion.three_opt import improve
 
 EXACT_UP_TO = 12
 KICKS = 1000
-_GAIN = 1e-12  # relative: a move must gain more than rounding
 
 
 @part()
@@ -55,112 +54,6 @@ def _nearest_neighbour(D: Floats, first: int) -> Ints:
     return t
 
 
-@part()
-def _length(D: Floats, t: Ints) -> float:
-    total = 0.0
-    for x in range(1, len(t) - 1):
-        total += D[t[x], t[x + 1]]
-    return total
-
-
-@part()
-def _two_opt(D: Floats, t: Ints, threshold: float) -> None:
-    """Reverse segments of ``t`` in place until no reversal gains more than ``threshold``."""
-    N = len(t)
-    improved = True
-    while improved:
-        improved = False
-        for i in range(N - 2):
-            for j in range(i + 2, N):
-                after = t[j + 1] if j + 1 < N else t[0]
-                gain = D[t[i], t[i + 1]] + D[t[j], after] - D[t[i], t[j]] - D[t[i + 1], after]
-                if gain > threshold:
-                    low, high = i + 1, j
-                    while low < high:
-                        t[low], t[high] = t[high], t[low]
-                        low += 1
-                        high -= 1
-                    improved = True
-
-
-@part(fastmath=FAST | {"nnan"})
-def _three_opt_move(D: Floats, t: Ints, P: Floats, threshold: float) -> bool:
-    """Apply one pure 3-opt move that gains more than ``threshold``; False when ``t`` is 3-optimal.
-
-    Legs (i, i+1), (j, j+1), (k, k+1) are replaced; A = t[i+1..j], B = t[j+1..k]. The four reconnections:
-    A' B', B A, B A', B' A (a prime reverses). All k of one (i, j) are tried at once, the best one is taken.
-    """
-    N = len(t)
-    for x in range(N):
-        for y in range(N):
-            P[x, y] = D[t[x], t[y]]
-        P[x, N] = P[x, 0]
-    legs = np.empty(N)
-    for x in range(N):
-        legs[x] = P[x, x + 1]
-    one = np.uint64(1)  # unsigned indices: a signed one is tested for < 0, which keeps the loop scalar
-    for i in range(N - 2):
-        for j in range(i + 1, N - 1):
-            base = P[i, i + 1] + P[j, j + 1] - threshold
-            across, back, join = P[i, j] - base, P[i, j + 1] - base, P[i + 1, j + 1] - base
-            row_i, row_i1, row_j, row_j1 = np.uint64(i), np.uint64(i + 1), np.uint64(j), np.uint64(j + 1)
-            hits = 0  # counting vectorises, taking a minimum does not
-            for x in range(N - 1 - j):
-                k = np.uint64(x) + row_j1
-                leg = legs[k]
-                hits += int(
-                    (across + P[row_i1, k] + P[row_j1, k + one] < leg)
-                    | (back + P[row_i1, k] + P[row_j, k + one] < leg)
-                    | (back + P[row_j, k] + P[row_i1, k + one] < leg)
-                    | (join + P[row_i, k] + P[row_j, k + one] < leg)
-                )
-            if hits:
-                _reconnect(t, P, i, j)
-                return True
-    return False
-
-
-@part()
-def _reconnect(t: Ints, P: Floats, i: int, j: int) -> None:
-    """Apply to ``t`` the best of the reconnections of :func:`_three_opt_move` for (i, j)."""
-    N = len(t)
-    best, best_k, best_kind = np.inf, j + 1, 0
-    for k in range(j + 1, N):
-        leg = P[k, k + 1]
-        lengths = (
-            P[i, j] + P[i + 1, k] + P[j + 1, k + 1] - leg,
-            P[i, j + 1] + P[i + 1, k] + P[j, k + 1] - leg,
-            P[i, j + 1] + P[j, k] + P[i + 1, k + 1] - leg,
-            P[i, k] + P[i + 1, j + 1] + P[j, k + 1] - leg,
-        )
-        for kind in range(4):
-            if lengths[kind] < best:
-                best, best_k, best_kind = lengths[kind], k, kind
-    old = t[i + 1 : best_k + 1].copy()
-    a, total = j - i, best_k - i
-    b = total - a
-    for x in range(total):
-        if best_kind == 0:
-            source = a - 1 - x if x < a else total - 1 - (x - a)
-        elif best_kind == 1:
-            source = a + x if x < b else x - b
-        elif best_kind == 2:
-            source = a + x if x < b else a - 1 - (x - b)
-        else:
-            source = total - 1 - x if x < b else x - b
-        t[i + 1 + x] = old[source]
-
-
-@part()
-def _improve(D: Floats, t: Ints, P: Floats) -> float:
-    """Make ``t`` 2-optimal and 3-optimal in place; return its open length."""
-    threshold = _GAIN * (_length(D, t) + 1e-300)
-    _two_opt(D, t, threshold)
-    while len(t) > 4 and _three_opt_move(D, t, P, threshold):
-        _two_opt(D, t, threshold)
-    return float(_length(D, t))
-
-
 @entry()
 def nearest_neighbour_3opt(distance: Floats) -> tuple[Ints, float]:
     """Return (order (n,), length) of the source paper's heuristic: nearest neighbour from node 0, then full 3-opt.
@@ -170,7 +63,7 @@ def nearest_neighbour_3opt(distance: Floats) -> tuple[Ints, float]:
     """
     D = _with_dummy(distance)
     t = _nearest_neighbour(D, 1) if len(D) > 1 else np.arange(len(D))
-    length = _improve(D, t, np.empty((len(D), len(D) + 1)))
+    length = improve(D, t, np.empty((len(D) + 1, len(D) + 1)))
     return _without_dummy(t), length
 
 
@@ -193,7 +86,7 @@ def heuristic_length(positions: Floats) -> float:
             D[a + 1, b + 1] = D[b + 1, a + 1] = np.sqrt(square)
     if n < 2:
         return 0.0
-    return float(_improve(D, _nearest_neighbour(D, 1), np.empty((n + 1, n + 2))))
+    return float(improve(D, _nearest_neighbour(D, 1), np.empty((n + 2, n + 2))))
 
 
 @entry()
@@ -251,12 +144,12 @@ def iterated_local_search(distance: Floats, cuts: Ints) -> tuple[Ints, float]:
     """
     D = _with_dummy(distance)
     N = len(D)
-    P = np.empty((N, N + 1))
+    P = np.empty((N + 1, N + 1))
     best = np.arange(N)
-    best_length = _improve(D, best, P)
+    best_length = improve(D, best, P)
     for first in range(1, N):
         t = _nearest_neighbour(D, first)
-        length = _improve(D, t, P)
+        length = improve(D, t, P)
         if length < best_length:
             best, best_length = t, length
     for kick in range(len(cuts)):
@@ -270,7 +163,7 @@ def iterated_local_search(distance: Floats, cuts: Ints) -> tuple[Ints, float]:
                 t[x] = best[c + y - (N - d)]
             else:
                 t[x] = best[b + y - (N - c)]
-        length = _improve(D, t, P)
+        length = improve(D, t, P)
         if length <= best_length:
             best, best_length = t, length
     return _without_dummy(best), best_length

@@ -138,86 +138,90 @@ def blocked(rows: Floats) -> Floats:
     return np.ascontiguousarray(padded.reshape(len(rows), count, LANES).transpose(1, 0, 2)).ravel()
 
 
-@part(fastmath=FAST)
-def add_four_cameras(moments: Floats, points: Floats, directions: Floats, weights: Floats, radius: float) -> None:
-    """Add four cameras to the moments of all points: one pass over memory, weights instead of branches.
+WEIGHT, MOMENTS, VARIANCES, SPARE, ROWS = 3, 4, 13, 16, 17
+"""Rows of a block at work: x, y, z; weights; xx, xy, xz, yy, yz, zz of S_uu and S_u; variances along x, y, z; spare.
+
+All in one array: where rows of several arrays meet, the compiler has to prove or test that they do not overlap.
+"""
+
+
+@part(fastmath=FAST, allocates=False)
+def add_camera(block: Floats, ax: float, ay: float, az: float, radius: float, sign: float) -> None:
+    """Add a camera in the direction (ax, ay, az) of a sphere to the moments of a block of points.
 
     Args:
-        moments: blocks of 9 rows, xx, xy, xz, yy, yz, zz of S_uu, then S_u; changed in place.
-        points: blocks of 3 rows, x, y, z relative to the sphere's centre, m.
-        directions: (4, 3) unit vectors of the cameras.
-        weights: blocks of 4 rows: 1 or 1/sigma² where the camera sees the point, 0 where not; negative takes away.
+        block: (ROWS * LANES,) changed in place. Its points are relative to the sphere's centre, m; its weights are 1 or
+            1/sigma² where the camera sees the point, 0 where not.
+        radius: R in m.  sign: 1, or -1 to take the camera away.
+    """
+    for lane in range(LANES):
+        p = np.uint64(lane)  # unsigned: a signed index is tested for < 0, which keeps the loop scalar
+        x, y, z = block[p], block[p + np.uint64(LANES)], block[p + np.uint64(2 * LANES)]
+        depth = radius - (ax * x + ay * y + az * z)
+        square = depth * depth
+        s = sign * block[p + np.uint64(WEIGHT * LANES)] / (square * square)
+        s_x, s_y, s_z = s * ax, s * ay, s * az
+        block[p + np.uint64(4 * LANES)] += s_x * ax
+        block[p + np.uint64(5 * LANES)] += s_x * ay
+        block[p + np.uint64(6 * LANES)] += s_x * az
+        block[p + np.uint64(7 * LANES)] += s_y * ay
+        block[p + np.uint64(8 * LANES)] += s_y * az
+        block[p + np.uint64(9 * LANES)] += s_z * az
+        block[p + np.uint64(10 * LANES)] += s_x
+        block[p + np.uint64(11 * LANES)] += s_y
+        block[p + np.uint64(12 * LANES)] += s_z
+
+
+@part(fastmath=FAST, allocates=False)
+def block_variances(block: Floats, radius: float, count: int) -> tuple[float, int]:
+    """Write the variances of a block from its moments; return their sum and how many points are WEAK.
+
+    Args:
+        block: (ROWS * LANES,) as in :func:`add_camera`; variances in units of 1 / f², m² when multiplied by
+            sigma² / f² for unit weights.
         radius: R in m.
+        count: points in the block; what pads it gets variance 0. Variances of WEAK points mean nothing.
     """
-    ax, ay, az = directions[0, 0], directions[0, 1], directions[0, 2]
-    bx, by, bz = directions[1, 0], directions[1, 1], directions[1, 2]
-    cx, cy, cz = directions[2, 0], directions[2, 1], directions[2, 2]
-    dx, dy, dz = directions[3, 0], directions[3, 1], directions[3, 2]
-    for block in range(len(points) // (3 * LANES)):
-        p0, w0 = np.uint64(block) * np.uint64(3 * LANES), np.uint64(block) * np.uint64(4 * LANES)
-        s0 = np.uint64(block) * np.uint64(9 * LANES)
-        for lane in range(LANES):
-            p, w, s = p0 + np.uint64(lane), w0 + np.uint64(lane), s0 + np.uint64(lane)
-            x, y, z = points[p], points[p + np.uint64(LANES)], points[p + np.uint64(2 * LANES)]
-            a, b = radius - (ax * x + ay * y + az * z), radius - (bx * x + by * y + bz * z)
-            c, d = radius - (cx * x + cy * y + cz * z), radius - (dx * x + dy * y + dz * z)
-            a, b, c, d = a * a, b * b, c * c, d * d
-            a, b = weights[w] / (a * a), weights[w + np.uint64(LANES)] / (b * b)
-            c, d = weights[w + np.uint64(2 * LANES)] / (c * c), weights[w + np.uint64(3 * LANES)] / (d * d)
-            a_x, b_x, c_x, d_x = a * ax, b * bx, c * cx, d * dx
-            a_y, b_y, c_y, d_y = a * ay, b * by, c * cy, d * dy
-            a_z, b_z, c_z, d_z = a * az, b * bz, c * cz, d * dz
-            moments[s] += a_x * ax + b_x * bx + c_x * cx + d_x * dx
-            moments[s + np.uint64(LANES)] += a_x * ay + b_x * by + c_x * cy + d_x * dy
-            moments[s + np.uint64(2 * LANES)] += a_x * az + b_x * bz + c_x * cz + d_x * dz
-            moments[s + np.uint64(3 * LANES)] += a_y * ay + b_y * by + c_y * cy + d_y * dy
-            moments[s + np.uint64(4 * LANES)] += a_y * az + b_y * bz + c_y * cz + d_y * dz
-            moments[s + np.uint64(5 * LANES)] += a_z * az + b_z * bz + c_z * cz + d_z * dz
-            moments[s + np.uint64(6 * LANES)] += a_x + b_x + c_x + d_x
-            moments[s + np.uint64(7 * LANES)] += a_y + b_y + c_y + d_y
-            moments[s + np.uint64(8 * LANES)] += a_z + b_z + c_z + d_z
-
-
-@part(fastmath=FAST)
-def variances_from_moments(moments: Floats, points: Floats, radius: float, count: int, variances: Floats) -> int:
-    """Write the variances along x, y, z and return how many points are WEAK (their variances mean nothing).
-
-    Args:
-        moments, points, radius: as in :func:`add_four_cameras`.
-        count: m; what pads the last block gets variance 0.
-        variances: blocks of 3 rows, in units of 1 / f² (m² when multiplied by sigma² / f² for unit weights).
-    """
-    weak = 0
+    weak, trace_sum = 0, 0.0
     square = radius * radius
-    for block in range(len(points) // (3 * LANES)):
-        p0, s0 = np.uint64(block) * np.uint64(3 * LANES), np.uint64(block) * np.uint64(9 * LANES)
-        left = count - block * LANES
-        for lane in range(LANES):
-            p, s = p0 + np.uint64(lane), s0 + np.uint64(lane)
-            x, y, z = points[p], points[p + np.uint64(LANES)], points[p + np.uint64(2 * LANES)]
-            sxx, sxy, sxz = moments[s], moments[s + np.uint64(LANES)], moments[s + np.uint64(2 * LANES)]
-            syy, syz = moments[s + np.uint64(3 * LANES)], moments[s + np.uint64(4 * LANES)]
-            szz, sx = moments[s + np.uint64(5 * LANES)], moments[s + np.uint64(6 * LANES)]
-            sy, sz = moments[s + np.uint64(7 * LANES)], moments[s + np.uint64(8 * LANES)]
-            total = sxx + syy + szz
-            # |d|² summed over the cameras; N = spread I - A - B with A the d dᵀ part, B = [P]x S_uu [P]xᵀ.
-            spread = total * (x * x + y * y + z * z + square) - 2.0 * radius * (x * sx + y * sy + z * sz)
-            a0, a1, a2 = y * sxz - z * sxy, y * syz - z * syy, y * szz - z * syz
-            b0, b1, b2 = z * sxx - x * sxz, z * sxy - x * syz, z * sxz - x * szz
-            c0, c1 = x * sxy - y * sxx, x * syy - y * sxy
-            nxx = spread - (total * x * x - 2.0 * radius * x * sx + square * sxx) - (y * a2 - z * a1)
-            nyy = spread - (total * y * y - 2.0 * radius * y * sy + square * syy) - (z * b0 - x * b2)
-            nzz = spread - (total * z * z - 2.0 * radius * z * sz + square * szz) - (x * c1 - y * c0)
-            nxy = radius * (x * sy + y * sx) - total * x * y - square * sxy - (z * a0 - x * a2)
-            nxz = radius * (x * sz + z * sx) - total * x * z - square * sxz - (x * a1 - y * a0)
-            nyz = radius * (y * sz + z * sy) - total * y * z - square * syz - (x * b1 - y * b0)
-            cxx, cyy, czz = nyy * nzz - nyz * nyz, nxx * nzz - nxz * nxz, nxx * nyy - nxy * nxy
-            determinant = nxx * cxx + nxy * (nxz * nyz - nxy * nzz) + nxz * (nxy * nyz - nxz * nyy)
-            trace = nxx + nyy + nzz
-            real = lane < left
-            weak += int(real & (determinant <= WEAK * trace * trace * trace))
-            scale = 1.0 / determinant if real else 0.0
-            variances[p] = cxx * scale if real else 0.0
-            variances[p + np.uint64(LANES)] = cyy * scale if real else 0.0
-            variances[p + np.uint64(2 * LANES)] = czz * scale if real else 0.0
-    return weak
+    for lane in range(LANES):
+        p = np.uint64(lane)
+        x, y, z = block[p], block[p + np.uint64(LANES)], block[p + np.uint64(2 * LANES)]
+        sxx, sxy, sxz = (
+            block[p + np.uint64(4 * LANES)],
+            block[p + np.uint64(5 * LANES)],
+            block[p + np.uint64(6 * LANES)],
+        )
+        syy, syz, szz = (
+            block[p + np.uint64(7 * LANES)],
+            block[p + np.uint64(8 * LANES)],
+            block[p + np.uint64(9 * LANES)],
+        )
+        sx, sy, sz = (
+            block[p + np.uint64(10 * LANES)],
+            block[p + np.uint64(11 * LANES)],
+            block[p + np.uint64(12 * LANES)],
+        )
+        total = sxx + syy + szz
+        # |d|² summed over the cameras; N = spread I - A - B with A the d dᵀ part, B = [P]x S_uu [P]xᵀ.
+        spread = total * (x * x + y * y + z * z + square) - 2.0 * radius * (x * sx + y * sy + z * sz)
+        a0, a1, a2 = y * sxz - z * sxy, y * syz - z * syy, y * szz - z * syz
+        b0, b1, b2 = z * sxx - x * sxz, z * sxy - x * syz, z * sxz - x * szz
+        c0, c1 = x * sxy - y * sxx, x * syy - y * sxy
+        nxx = spread - (total * x * x - 2.0 * radius * x * sx + square * sxx) - (y * a2 - z * a1)
+        nyy = spread - (total * y * y - 2.0 * radius * y * sy + square * syy) - (z * b0 - x * b2)
+        nzz = spread - (total * z * z - 2.0 * radius * z * sz + square * szz) - (x * c1 - y * c0)
+        nxy = radius * (x * sy + y * sx) - total * x * y - square * sxy - (z * a0 - x * a2)
+        nxz = radius * (x * sz + z * sx) - total * x * z - square * sxz - (x * a1 - y * a0)
+        nyz = radius * (y * sz + z * sy) - total * y * z - square * syz - (x * b1 - y * b0)
+        cxx, cyy, czz = nyy * nzz - nyz * nyz, nxx * nzz - nxz * nxz, nxx * nyy - nxy * nxy
+        determinant = nxx * cxx + nxy * (nxz * nyz - nxy * nzz) + nxz * (nxy * nyz - nxz * nyy)
+        trace = nxx + nyy + nzz
+        real = lane < count
+        weak += int(real & (determinant <= WEAK * trace * trace * trace))
+        scale = 1.0 / determinant if real else 0.0
+        block[p + np.uint64(13 * LANES)] = cxx * scale if real else 0.0
+        block[p + np.uint64(14 * LANES)] = cyy * scale if real else 0.0
+        block[p + np.uint64(15 * LANES)] = czz * scale if real else 0.0
+        trace_sum += (cxx + cyy + czz) * scale if real else 0.0
+    return trace_sum, weak

@@ -7,73 +7,21 @@ exactly, in ``finish``.
 """
 
 import math
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from netdesign.model.arrays import Bools, Floats, Ints
-from netdesign.model.compiled import FAST, entry, part
-from netdesign.model.scene import CORNERS_PER_TAG
+from netdesign.model.compiled import entry, part
 from netdesign.motion.joint_tour import SearchWork, Work, network_tour, search_work_for
 from netdesign.motion.tour import heuristic_length
-from netdesign.photogrammetry.limited_error import LANES, add_four_cameras, variances_from_moments
+from netdesign.photogrammetry.limited_error import LANES, ROWS
+from netdesign.placement.blocks import network_blocks, precision_objective
+from netdesign.placement.tables import JointTables, SphereTables
 from netdesign.placement.visibility_map import cell_index
 
-MEAN_VARIANCE, MAX_SIGMA = 0, 1
 
-FOUR_TAGS = np.repeat((np.arange(16)[:, None] >> np.arange(4)) & 1, CORNERS_PER_TAG, axis=1).ravel().astype(np.float64)
-"""What four bits become: 1 for every corner of a tag that is seen, (16 x LANES,)."""
-
-
-class SphereTables(NamedTuple):
-    """What the kernels look up; arrays of the visibility map are described there.
-
-    Attributes:
-        points: blocks of x, y, z relative to the centre (``limited_error.blocked``).  point_count: m.  tags: g.
-        radius: R in m.  grid, sure: of the VisibilityMap.
-        weight: (rows, LANES per block) 1 / sigma² of a point's sighting relative to ``variance``; one row when sigma is
-            constant.
-        weight_grid: (6,) grid of the rows of ``weight``.
-        variance: m² per unit of the moment form, sigma² / f².
-        min_rays, min_tags: images per tag, tags per image.
-        criterion: MEAN_VARIANCE or MAX_SIGMA.
-        longest: admissible workspace f2.
-        limits: (4,) lowest and highest azimuth, lowest and highest elevation, rad.
-        fixed: the first images of every network, which stay where they are.
-    """
-
-    points: Floats
-    point_count: int
-    tags: int
-    radius: float
-    grid: Floats
-    sure: NDArray[np.uint64]
-    weight: Floats
-    weight_grid: Floats
-    variance: float
-    min_rays: int
-    min_tags: int
-    criterion: int
-    longest: float
-    limits: Floats
-    fixed: int = 0
-
-
-class JointTables(NamedTuple):
-    """What the joint-space tour looks up: arrays of the JointMap; law, timed and dwell (s) of ``motion.joint_tour``.
-
-    longest: admissible f2.
-    """
-
-    arrays: Any
-    law: Floats
-    timed: bool
-    dwell: float
-    longest: float
-
-
-@part()
+@part(allocates=False)
 def popcount(word: np.uint64) -> int:
     """Return the number of bits set in 64 bits (SWAR; H. S. Warren, Hacker's Delight, chapter 5)."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
@@ -82,7 +30,7 @@ def popcount(word: np.uint64) -> int:
     return int((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@part()
+@part(allocates=False)
 def missing_sightings(cells: Ints, tables: SphereTables, at_least: NDArray[np.uint64]) -> float:
     """Return the rays that tags lack plus the shares of tags that images lack, for images in ``cells`` (k,).
 
@@ -110,7 +58,7 @@ def missing_sightings(cells: Ints, tables: SphereTables, at_least: NDArray[np.ui
     return lacking if lacking > 0.0 else float(loose_images(cells, tables.sure, at_least[0]))
 
 
-@part()
+@part(allocates=False)
 def loose_images(cells: Ints, sure: NDArray[np.uint64], reached: NDArray[np.uint64]) -> int:
     """Return how many images, in ``cells`` (k,), share no tag with the first one, not even by way of others.
 
@@ -139,69 +87,14 @@ def loose_images(cells: Ints, sure: NDArray[np.uint64], reached: NDArray[np.uint
     return loose
 
 
-@part()
+@part(allocates=False)
 def write_direction(alpha: float, beta: float, direction: Floats) -> None:
     """Write the unit vector (3,) of a viewpoint."""
     flat = math.cos(beta)
     direction[0], direction[1], direction[2] = flat * math.cos(alpha), flat * math.sin(alpha), math.sin(beta)
 
 
-@part()
-def write_weights(
-    alpha: float, beta: float, cell: int, sign: float, slot: int, tables: SphereTables, weights: Floats
-) -> None:
-    """Write into ``slot`` of blocks of 4 rows what each point's sighting from a viewpoint weighs, times ``sign``."""
-    constant = len(tables.weight) == 1
-    row = np.uint64(0 if constant else cell_index(alpha, beta, tables.weight_grid))
-    for block in range(tables.weight.shape[1] // LANES):
-        tag = np.uint64(4 * block)
-        four_tags = (tables.sure[cell, tag >> np.uint64(6)] >> (tag & np.uint64(63))) & np.uint64(15)
-        start, first = np.uint64((4 * block + slot) * LANES), four_tags * np.uint64(LANES)
-        if sign != 1.0:
-            for lane in range(LANES):
-                weights[start + np.uint64(lane)] = sign * FOUR_TAGS[first + np.uint64(lane)]
-        else:
-            for lane in range(LANES):
-                weights[start + np.uint64(lane)] = FOUR_TAGS[first + np.uint64(lane)]
-        if not constant:
-            first = np.uint64(block * LANES)
-            for lane in range(LANES):
-                weights[start + np.uint64(lane)] *= tables.weight[row, first + np.uint64(lane)]
-
-
-@part()
-def write_moments(
-    viewpoints: Floats, directions: Floats, cells: Ints, tables: SphereTables, weights: Floats, four: Floats,
-    moments: Floats,
-) -> None:  # fmt: skip
-    """Write the moments of viewpoints (k, 2), whose directions and cells are known; ``weights``, ``four``: scratch."""
-    moments[:] = 0.0
-    k = len(viewpoints)
-    for first in range(0, k, 4):
-        for slot in range(4):
-            i = min(first + slot, k - 1)
-            sign = 1.0 if first + slot < k else 0.0
-            write_weights(viewpoints[i, 0], viewpoints[i, 1], cells[i], sign, slot, tables, weights)
-            for axis in range(3):
-                four[slot, axis] = directions[i, axis]
-        add_four_cameras(moments, tables.points, four, weights, tables.radius)
-
-
-@part(fastmath=FAST)
-def precision_objective(variances: Floats, tables: SphereTables) -> float:
-    """Return f1 from the variances: their mean in m², or the square root of the largest in m."""
-    if tables.criterion == MAX_SIGMA:
-        largest = 0.0
-        for value in variances:
-            largest = max(largest, value)
-        return float(math.sqrt(largest * tables.variance))
-    total = 0.0
-    for value in variances:
-        total += value
-    return total * tables.variance / (3 * tables.point_count)
-
-
-@part()
+@part(allocates=False)
 def excess(length: float, longest: float) -> float:
     """Return how far a tour is beyond the longest admissible one, in [0, 1)."""
     return max(0.0, 1.0 - longest / length) if length > 0.0 else 0.0
@@ -241,11 +134,9 @@ def evaluate_networks(bits: Bools, genes: Floats, tables: SphereTables, objectiv
     count, slots = bits.shape
     blocks = len(tables.points) // (3 * LANES)
     viewpoints, directions = np.zeros((slots, 2)), np.zeros((slots, 3))
-    four = np.zeros((4, 3))
-    cells = np.zeros(slots, np.int64)
+    cells, rows = np.zeros(slots, np.int64), np.zeros(slots, np.int64)
     at_least = np.zeros((tables.min_rays, tables.sure.shape[1]), np.uint64)
-    weights, moments = np.zeros(blocks * 4 * LANES), np.zeros(blocks * 9 * LANES)
-    variances = np.zeros(blocks * 3 * LANES)
+    block, values, moments = np.zeros(ROWS * LANES), np.zeros(blocks), np.zeros(0)
     for p in range(count):
         k = 0
         for slot in range(slots):
@@ -260,9 +151,8 @@ def evaluate_networks(bits: Bools, genes: Floats, tables: SphereTables, objectiv
         if lacking > 0:
             violation[p] = 1.0 + lacking  # always worse than a tour that is too long
             continue
-        write_moments(viewpoints[:k], directions, cells, tables, weights, four, moments)
-        violation[p] = variances_from_moments(moments, tables.points, tables.radius, tables.point_count, variances)
-        objectives[p, 0], objectives[p, 1] = precision_objective(variances, tables), 0.0
+        violation[p] = network_blocks(viewpoints[:k], directions, cells, rows, tables, block, values, moments)
+        objectives[p, 0], objectives[p, 1] = precision_objective(values, tables), 0.0
 
 
 @entry(nogil=True)

@@ -15,17 +15,22 @@ import numpy as np
 
 from netdesign.model.arrays import Floats, Ints
 from netdesign.model.compiled import entry, part
-from netdesign.motion.tour import _improve
-from netdesign.photogrammetry.limited_error import LANES, add_four_cameras, variances_from_moments
-from netdesign.placement.evaluation import (
-    SphereTables,
-    excess,
-    missing_sightings,
+from netdesign.motion.three_opt import improve
+from netdesign.photogrammetry.limited_error import LANES, ROWS, add_camera, block_variances
+from netdesign.placement.blocks import (
+    KEPT,
+    largest_variance,
+    load_moments,
+    network_blocks,
     precision_objective,
-    write_direction,
-    write_moments,
+    save_moments,
+    seen_tags,
+    weight_row,
+    write_points,
     write_weights,
 )
+from netdesign.placement.evaluation import excess, missing_sightings, write_direction
+from netdesign.placement.tables import MAX_SIGMA, SphereTables
 from netdesign.placement.visibility_map import cell_index
 
 PROMISING = 0.05  # of the weighted logarithms: a move this near to an improvement gets its tour repaired
@@ -50,7 +55,7 @@ class Tries(NamedTuple):
     preference: Floats
 
 
-@part()
+@part(allocates=False)
 def write_step(viewpoint: Floats, direction: Floats, step: Floats, limits: Floats, moved: Floats) -> None:
     """Write the viewpoint (2,) after a step (bearing, length) along the sphere, folded into ``limits`` (4,)."""
     east_x, east_y = -math.sin(viewpoint[0]), math.cos(viewpoint[0])
@@ -65,7 +70,7 @@ def write_step(viewpoint: Floats, direction: Floats, step: Floats, limits: Float
     moved[1] = min(max(math.atan2(z, math.sqrt(x * x + y * y)), limits[2]), limits[3])
 
 
-@part()
+@part(allocates=False)
 def write_chords(directions: Floats, k: int, a: int, D: Floats) -> None:
     """Write the chords from station ``a`` to the ``k`` stations with unit directions; station i is node i + 1."""
     for b in range(k):
@@ -75,7 +80,7 @@ def write_chords(directions: Floats, k: int, a: int, D: Floats) -> None:
         D[a + 1, b + 1] = D[b + 1, a + 1] = math.sqrt(square)
 
 
-@part()
+@part(allocates=False)
 def reinserted(D: Floats, t: Ints, count: int, gone: int, new: int, moved: Floats, out: Ints) -> float:
     """Write the closed tour t (count,) without node ``gone``, and with ``new`` where it costs least; return its length.
 
@@ -116,10 +121,12 @@ def improve_networks(
     blocks = len(tables.points) // (3 * LANES)
     now, then = np.zeros((slots + 1, 3)), np.zeros((slots + 1, 3))  # directions
     cells, new_cells = np.zeros(slots + 1, np.int64), np.zeros(slots + 1, np.int64)
-    four, weights = np.zeros((4, 3)), np.zeros(blocks * 4 * LANES)
-    moments, changed = np.zeros(blocks * 9 * LANES), np.zeros(blocks * 9 * LANES)
-    variances = np.zeros(blocks * 3 * LANES)
+    rows, block = np.zeros(slots + 1, np.int64), np.zeros(ROWS * LANES)
+    values, new_values = np.zeros(blocks), np.zeros(blocks)
+    moments, changed = np.zeros(blocks * KEPT), np.zeros(blocks * KEPT)
     at_least = np.zeros((tables.min_rays, tables.sure.shape[1]), np.uint64)
+    sure, weight, points, radius, count = tables.sure, tables.weight, tables.points, tables.radius, tables.point_count
+    worst = tables.criterion == MAX_SIGMA
     D, trial_D = np.zeros((slots + 2, slots + 2)), np.zeros((slots + 2, slots + 2))
     P = np.zeros((slots + 2, slots + 3))
     t, trial = np.zeros(slots + 2, np.int64), np.zeros(slots + 2, np.int64)
@@ -128,15 +135,13 @@ def improve_networks(
         for i in range(k):
             write_direction(here[i, 0], here[i, 1], now[i])
             cells[i] = cell_index(here[i, 0], here[i, 1], tables.grid)
-        write_moments(here[:k], now, cells, tables, weights, four, moments)
-        weights[:] = 0.0  # slots 2 and 3 stay empty from here on
-        variances_from_moments(moments, tables.points, tables.radius, tables.point_count, variances)
-        f1 = precision_objective(variances, tables)
+        network_blocks(here[:k], now, cells, rows, tables, block, values, moments)
+        f1 = precision_objective(values, tables)
         for i in range(k):
             write_chords(now, k, i, D)
         for x in range(k + 1):
             t[x] = x
-        f2 = tables.radius * _improve(D, t[: k + 1], P)
+        f2 = tables.radius * improve(D, t[: k + 1], P)
         w = tries.preference[b]
         value = w * math.log(f1) + (1.0 - w) * math.log(f2 + 1e-9)
         for c in range(tries.kind.shape[1]):
@@ -165,21 +170,31 @@ def improve_networks(
             if lacking > 0:
                 violation[b, c] = 1.0 + lacking
                 continue
-            j = i % k  # what an addition takes away weighs nothing, and so does what a removal adds
-            write_weights(there[j, 0], there[j, 1], new_cells[j], 0.0 if kind == REMOVE else 1.0, 0, tables, weights)
-            if kind == ADD:
-                write_weights(there[i, 0], there[i, 1], new_cells[i], 1.0, 0, tables, weights)
-            write_weights(here[j, 0], here[j, 1], cells[j], 0.0 if kind == ADD else -1.0, 1, tables, weights)
-            for axis in range(3):
-                four[0, axis], four[1, axis] = then[i if kind == ADD else j, axis], now[j, axis]
-            for s in range(len(moments)):
-                changed[s] = moments[s]
-            add_four_cameras(changed, tables.points, four, weights, tables.radius)
-            weak = variances_from_moments(changed, tables.points, tables.radius, tables.point_count, variances)
+            new_cell, new_row = np.int64(-1), 0
+            if kind != REMOVE:
+                new_cell, new_row = new_cells[i], weight_row(there[i, 0], there[i, 1], tables)
+            weak = 0
+            for index in range(blocks):
+                coming = np.uint64(0) if kind == REMOVE else seen_tags(new_cell, index, sure)
+                going = np.uint64(0) if kind == ADD else seen_tags(cells[i], index, sure)
+                new_values[index] = values[index]
+                write_points(index, points, block)
+                load_moments(index, moments, block)
+                if coming != np.uint64(0):
+                    write_weights(index, coming, new_row, weight, block)
+                    add_camera(block, then[i, 0], then[i, 1], then[i, 2], radius, 1.0)
+                if going != np.uint64(0):
+                    write_weights(index, going, rows[i], weight, block)
+                    add_camera(block, now[i, 0], now[i, 1], now[i, 2], radius, -1.0)
+                if (coming | going) != np.uint64(0):  # where neither is seen nothing changes
+                    total, lost = block_variances(block, radius, count - index * LANES)
+                    new_values[index] = largest_variance(block) if worst else total
+                    weak += lost
+                save_moments(index, block, changed)
             if weak > 0:
                 violation[b, c] = weak
                 continue
-            new_f1 = precision_objective(variances, tables)
+            new_f1 = precision_objective(new_values, tables)
             if kind == REMOVE:
                 length = reinserted(D, t, k + 1, i + 1, -1, D[0], trial)
             else:
@@ -193,7 +208,7 @@ def improve_networks(
                     for y in range(1, k + 1):
                         if x != i + 1 and y != i + 1:
                             trial_D[x, y] = D[x, y]
-                new_f2 = tables.radius * _improve(trial_D, trial[: k + 1], P)
+                new_f2 = tables.radius * improve(trial_D, trial[: k + 1], P)
             objectives[b, c, 0], objectives[b, c, 1] = new_f1, new_f2
             violation[b, c] = excess(new_f2, tables.longest)
             new_value = w * math.log(new_f1) + (1.0 - w) * math.log(new_f2 + 1e-9)
@@ -202,8 +217,11 @@ def improve_networks(
             value = new_value
             here[i, 0], here[i, 1], cells[i] = there[i, 0], there[i, 1], new_cells[i]
             now[i, 0], now[i, 1], now[i, 2] = then[i, 0], then[i, 1], then[i, 2]
+            rows[i] = new_row
             for s in range(len(moments)):
                 moments[s] = changed[s]
+            for index in range(blocks):
+                values[index] = new_values[index]
             write_chords(now, k, i, D)
             for x in range(k + 1):
                 t[x] = trial[x]

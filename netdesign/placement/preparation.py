@@ -14,8 +14,9 @@ from netdesign.photogrammetry.limited_error import LANES, blocked
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.placement.coverage import coverage
 from netdesign.placement.encoding import Chromosomes
-from netdesign.placement.evaluation import MAX_SIGMA, MEAN_VARIANCE, JointTables, SphereTables, joint_tours
+from netdesign.placement.evaluation import joint_tours
 from netdesign.placement.set_cover import CANDIDATES, Cover, smallest_cover
+from netdesign.placement.tables import MAX_SIGMA, MEAN_VARIANCE, JointTables, SphereTables
 from netdesign.placement.visibility_map import VisibilityMap
 
 NOISE_STEP = np.radians(2.0)  # cells of the table of sigmas: they change slowly with the viewpoint

@@ -15,13 +15,7 @@ from netdesign.motion.joint_map import JointMap
 from netdesign.placement.bound import lower_bounds
 from netdesign.placement.distances import named_ends
 from netdesign.placement.encoding import LARGEST_STEP, SMALLEST_STEP, Chromosomes
-from netdesign.placement.evaluation import (
-    JointTables,
-    SphereTables,
-    evaluate_networks,
-    joint_tours,
-    workspace_tours,
-)
+from netdesign.placement.evaluation import evaluate_networks, joint_tours, workspace_tours
 from netdesign.placement.local_search import ADD, MOVE, REMOVE, Tries, improve_networks
 from netdesign.placement.network_problem import ADDITIONS, MOVES, REMOVALS, TELEPORTS, NetworkProblem
 from netdesign.placement.preparation import (
@@ -34,6 +28,7 @@ from netdesign.placement.preparation import (
     pinned_viewpoints,
     sphere_tables,
 )
+from netdesign.placement.tables import JointTables, SphereTables
 from netdesign.placement.visibility_map import VisibilityMap
 from netdesign.search.population import Population
 

@@ -119,7 +119,7 @@ class VisibilityMap:
         return _unpack(self.sure[cells] | self.maybe[cells], self.tag_count)
 
 
-@part()
+@part(allocates=False)
 def cell_index(alpha: float, beta: float, grid: Floats) -> int:
     """Return the cell of a viewpoint; the azimuth wraps, what lies outside goes to the nearest row or column."""
     turn = 2.0 * np.pi

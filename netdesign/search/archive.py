@@ -30,8 +30,8 @@ class Archive:
         return self.members.objectives[:, -1].astype(np.int64)
 
     def with_rows(self, candidates: Population) -> "Archive":
-        """Return the archive after the feasible candidates have been offered to it."""
-        everything = joined([self.members, candidates.feasible])
+        """Return the archive after feasible candidates have been offered to it."""
+        everything = joined([self.members, candidates])
         return Archive(members=everything.take(staircases(everything.objectives, EPSILON)))
 
 

@@ -29,6 +29,7 @@ Engine = Literal["memetic", "nsga2"]
 GENETIC_SHARE, GENETIC_MOST = 0.2, 60
 BREEDINGS = 20  # rounds of breeding that may replace copies
 SPARE = 4  # per cent of pairs that breed beyond need, in place of copies: cheaper than another round
+STRIDE = 10  # generations of breeding between two updates of the archive
 FEWEST_PICKS, MOST_PICKS = 8, 32  # members improved between two updates of the archive, a sixth of the population
 
 OnStep = Callable[[State], None]
@@ -71,13 +72,13 @@ def start(problem: SearchProblem, engine: Engine, population: int, seed: int) ->
     elif engine != "nsga2":
         raise InputError(f"engine: expected memetic or nsga2, found {engine}")
     first = evaluated(problem.evaluate, bits, genes)
-    archive = empty_archive(bits.shape[1], genes.shape[2], first.objectives.shape[1]).with_rows(first)
+    archive = empty_archive(bits.shape[1], genes.shape[2], first.objectives.shape[1])
     ranks, crowding = ranked(first)
     empty = State(
         step=0, population=first, ranks=ranks, crowding=crowding, archive=archive, evaluations=np.zeros(0, np.int64),
-        hypervolume=np.zeros(0), random="",
+        hypervolume=np.zeros(0), random=generator_state(rng), pending=(first,),
     )  # fmt: skip
-    return _noted(problem, empty, rng, len(first))
+    return _noted(problem, empty)
 
 
 def steps(problem: SearchProblem, engine: Engine, state: State, population: int, generations: int) -> Iterator[State]:
@@ -86,17 +87,19 @@ def steps(problem: SearchProblem, engine: Engine, state: State, population: int,
     budget = population * generations
     genetic = generations if engine == "nsga2" else min(GENETIC_MOST, max(1, round(GENETIC_SHARE * generations)))
     vary = problem.vary_plain if engine == "nsga2" else problem.vary_structured
-    while state.evaluations[-1] < budget:
+    while state.spent < budget:
         # Without a feasible network there is nothing to improve: go on breeding.
         if state.step < genetic or len(state.archive) == 0:
             children = offspring(rng, problem, state.population, state.ranks, state.crowding, vary)
             survivors, ranks, crowding = survive(joined([state.population, children]), population)
-            archive = state.archive.with_rows(children)
-            state = replace(state, population=survivors, ranks=ranks, crowding=crowding, archive=archive)
+            state = replace(state, population=survivors, ranks=ranks, crowding=crowding)
         else:
             children = problem.improve(rng, _picks(rng, state, population))
-            state = replace(state, archive=state.archive.with_rows(children))
-        state = _noted(problem, replace(state, step=state.step + 1), rng, len(children))
+        pending = (*state.pending, children)
+        state = replace(state, step=state.step + 1, random=generator_state(rng), pending=pending)
+        # Breeding does not look at the archive: it may wait.
+        if state.step % STRIDE == 0 or state.step >= genetic or state.spent >= budget:
+            state = _noted(problem, state)
         yield state
 
 
@@ -152,14 +155,15 @@ def _picks(rng: np.random.Generator, state: State, population: int) -> Populatio
     return state.archive.members.take(rows)
 
 
-def _noted(problem: SearchProblem, state: State, rng: np.random.Generator, spent: int) -> State:
-    """The state with one more line of history and the generator's state."""
-    before = int(state.evaluations[-1]) if len(state.evaluations) else 0
+def _noted(problem: SearchProblem, state: State) -> State:
+    """The state with what was pending in the archive and one more line of history."""
+    archive = state.archive.with_rows(joined([population.feasible for population in state.pending]))
     return replace(
         state,
-        evaluations=np.append(state.evaluations, before + spent),
-        hypervolume=np.append(state.hypervolume, hypervolume(problem, state.archive.members.objectives)),
-        random=generator_state(rng),
+        archive=archive,
+        evaluations=np.append(state.evaluations, state.spent),
+        hypervolume=np.append(state.hypervolume, hypervolume(problem, archive.members.objectives)),
+        pending=(),
     )
 
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from netdesign.errors import InputError
 from netdesign.search.archive import Archive
-from netdesign.search.population import Floats, Ints, Population
+from netdesign.search.population import Floats, Ints, Population, joined
 
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,8 +22,9 @@ class State:
     Attributes:
         step: generations done, those of the local search included.
         population: the current generation.  ranks, crowding: (P,) of it, as its survivors were chosen.
-        archive: the best of every size so far.
-        evaluations, hypervolume: (h,) history, one entry per step.
+        archive: the best of every size, of all but the pending ones.
+        pending: chromosomes evaluated since the archive was updated.
+        evaluations, hypervolume: (h,) history, one entry per update of the archive.
         random: state of the random numbers, JSON.
     """
 
@@ -35,6 +36,12 @@ class State:
     evaluations: Ints
     hypervolume: Floats
     random: str
+    pending: tuple[Population, ...] = ()
+
+    @property
+    def spent(self) -> int:
+        """Evaluations so far."""
+        return (int(self.evaluations[-1]) if len(self.evaluations) else 0) + sum(map(len, self.pending))
 
 
 def generator_state(rng: np.random.Generator) -> str:
@@ -66,7 +73,9 @@ def save(path: Path, state: State, key: str) -> None:
         "hypervolume": state.hypervolume,
         "random": np.array(state.random),
     }
-    for prefix, population in (("population", state.population), ("archive", state.archive.members)):
+    pending = joined([state.population.take(np.arange(0)), *state.pending])
+    stored = {"population": state.population, "archive": state.archive.members, "pending": pending}
+    for prefix, population in stored.items():
         for field in fields(population):
             arrays[f"{prefix}_{field.name}"] = getattr(population, field.name)
     try:
@@ -100,7 +109,7 @@ def load(path: Path, key: str) -> State:
                 raise InputError(f"{path}: this checkpoint belongs to another study, seed or version; delete it")
             populations = [
                 Population(**{field.name: stored[f"{prefix}_{field.name}"] for field in fields(Population)})
-                for prefix in ("population", "archive")
+                for prefix in ("population", "archive", "pending")
             ]
             return State(
                 step=int(stored["step"]),
@@ -111,6 +120,7 @@ def load(path: Path, key: str) -> State:
                 evaluations=stored["evaluations"],
                 hypervolume=stored["hypervolume"],
                 random=str(stored["random"]),
+                pending=(populations[2],) if len(populations[2]) else (),
             )
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as problem:
         raise InputError(f"{path}: not a readable checkpoint ({problem}); delete it") from problem

@@ -15,14 +15,10 @@ from netdesign.model.arrays import Bools, Floats
 from netdesign.model.compiled import entry
 from netdesign.model.frames import look_at, sphere_directions
 from netdesign.motion.tour import nearest_neighbour_3opt, open_path
-from netdesign.photogrammetry.limited_error import blocked
-from netdesign.placement.evaluation import (
-    SphereTables,
-    precision_objective,
-    variances_from_moments,
-    write_direction,
-    write_moments,
-)
+from netdesign.photogrammetry.limited_error import LANES, ROWS, blocked
+from netdesign.placement.blocks import network_blocks, precision_objective
+from netdesign.placement.evaluation import write_direction
+from netdesign.placement.tables import SphereTables
 from validation.benchmarks.table import Row
 
 NETWORKS, IMAGES, POINTS, RADIUS, FOCAL, SIGMA = 200, 30, 200, 0.6, 3600.0, 0.1
@@ -32,15 +28,14 @@ TEXTBOOK = 10  # networks of the slow side
 
 @entry()
 def _ours(viewpoints, cells, tables, out):
-    blocks = len(tables.points) // 48
-    directions, four = np.zeros((viewpoints.shape[1], 3)), np.zeros((4, 3))
-    weights, moments, variances = np.zeros(blocks * 64), np.zeros(blocks * 144), np.zeros(blocks * 48)
+    blocks, slots = len(tables.points) // (3 * LANES), viewpoints.shape[1]
+    directions, rows = np.zeros((slots, 3)), np.zeros(slots, np.int64)
+    block, values, moments = np.zeros(ROWS * LANES), np.zeros(blocks), np.zeros(0)
     for p in range(len(viewpoints)):
-        for i in range(viewpoints.shape[1]):
+        for i in range(slots):
             write_direction(viewpoints[p, i, 0], viewpoints[p, i, 1], directions[i])
-        write_moments(viewpoints[p], directions, cells[p], tables, weights, four, moments)
-        variances_from_moments(moments, tables.points, tables.radius, tables.point_count, variances)
-        out[p] = precision_objective(variances, tables)
+        network_blocks(viewpoints[p], directions, cells[p], rows, tables, block, values, moments)
+        out[p] = precision_objective(values, tables)
 
 
 class Sides:

@@ -15,7 +15,8 @@ from netdesign.model.compiled import entry
 from netdesign.motion.exact_tour import exact_joint_tour
 from netdesign.motion.joint_tour import law_of, network_tour, search_work_for
 from netdesign.motion.tour import path_length
-from netdesign.placement.evaluation import JointTables, joint_tours, write_direction
+from netdesign.placement.evaluation import joint_tours, write_direction
+from netdesign.placement.tables import JointTables
 from tests.cells import joint_map, reachable_viewpoints
 from validation.benchmarks.table import Row
 

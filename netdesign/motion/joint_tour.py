@@ -51,7 +51,7 @@ def chain_law(placed: Chain, weights: Floats) -> Floats:
     return law
 
 
-@part(fastmath=_NO_NAN)
+@part(fastmath=_NO_NAN, allocates=False)
 def _apart(first, second, turn):  # type: ignore[no-untyped-def]
     """Return how far a joint has to turn."""
     d = abs(first - second)
@@ -126,7 +126,7 @@ def work_for(n: int, r: int, most: int) -> Work:
     )  # fmt: skip
 
 
-@part()
+@part(allocates=False)
 def choose_options(options, count, label, barred, tour, law, timed, choice, work):  # type: ignore[no-untyped-def]
     """Write the best option of every station into choice (n,) for the closed tour (n + 1,) with its dummy in front.
 
@@ -165,7 +165,7 @@ def choose_options(options, count, label, barred, tour, law, timed, choice, work
     return length
 
 
-@part()
+@part(allocates=False)
 def _chosen_distances(options, label, barred, choice, law, timed, work):  # type: ignore[no-untyped-def]
     """Write the leg costs between the chosen options into work.distances, the dummy in front."""
     picked, legs, distances = work.picked, work.legs, work.distances

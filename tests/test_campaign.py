@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from netdesign.adjustment.campaign import RHO_MARGIN, Band, Member, _realisation
 from netdesign.adjustment.compare import compare
 from netdesign.adjustment.estimate import estimate
 from netdesign.adjustment.lengths import chosen_lengths, length_test, length_uncertainty
-from netdesign.adjustment.statistics import log_rms_moments
+from netdesign.adjustment.statistics import SumsOfSquares, log_rms_moments
 from netdesign.errors import InfeasibleError
 from netdesign.files.adjustment import campaign_member, campaign_payload, length_payload, validation_payload
 from netdesign.files.store import plain
@@ -67,7 +68,8 @@ def _drawn(weights, count, seed, factor=1.0):
     rho = factor * np.sqrt(random.standard_normal((count, len(weights))) ** 2 @ (weights / weights.sum()))
     return [
         Member(
-            name=str(index), t_sum=60.0, nu=60, vpv=200.0, r=200, rho=value, log_rho_mean=mean, log_rho_sd=sd,
+            name=str(index), t_sum=60.0, nu=60, vpv=200.0, r=200, expected=SumsOfSquares.independent(60, 200),
+            rho=value, log_rho_mean=mean, log_rho_sd=sd,
             coverage=0.95, points_used=20, pits={"t": 0.5, "s0_squared": 0.5, "f": 0.5, "rho": 0.5},
             predicted={"used": 2e-5}, achieved=2e-5 * value,
         )
@@ -118,6 +120,28 @@ def test_slope_is_one_over_networks_of_different_precision():
     assert campaign.kendall > 0.3
 
 
+def test_networks_with_correlated_image_points_are_pooled_with_what_is_expected_of_them():
+    """Sums whose means and variances are not those of chi²: the pooled verdict knows, and without that it rejects."""
+    random, count, t_mean, v_mean = np.random.default_rng(3), 120, 66.0, 190.0
+    # Gamma variables with these means, the variances twice those of chi².
+    t, v = random.gamma(t_mean / 4, 4.0, count), random.gamma(v_mean / 4, 4.0, count)
+    expected = SumsOfSquares(t_mean=t_mean, t_variance=4 * t_mean, v_mean=v_mean, v_variance=4 * v_mean, common=0.0)
+    plain_members = _drawn(np.ones(60), count, 4)
+    known = [replace(m, t_sum=a, vpv=b, expected=expected) for m, a, b in zip(plain_members, t, v, strict=True)]
+    ignored = [replace(m, t_sum=a, vpv=b) for m, a, b in zip(plain_members, t, v, strict=True)]
+    right, wrong = pool(known), pool(ignored)
+    assert right.t.inside
+    assert right.s0_squared.inside
+    assert right.f.inside
+    assert right.root_f.low < 1 < right.root_f.high
+    assert not wrong.t.inside
+    assert not wrong.s0_squared.inside
+    assert wrong.root_f.low > 1
+    # Twice the variance: intervals wider by the root of two.
+    width = (right.t.high - right.t.low) / (wrong.t.high - wrong.t.low)
+    assert width == pytest.approx(np.sqrt(2) * np.sqrt(t_mean / 60), rel=0.03)
+
+
 def test_repeats_split_bias_from_noise():
     rng = np.random.default_rng(0)
     bias = 1e-5 * rng.standard_normal((50, 3))
@@ -126,7 +150,8 @@ def test_repeats_split_bias_from_noise():
         errors = bias + 2e-5 * rng.standard_normal((50, 3))
         members.append(
             Member(
-                name="0", t_sum=143.0, nu=143, vpv=200.0, r=200, rho=1.0, log_rho_mean=-0.006, log_rho_sd=0.08,
+                name="0", t_sum=143.0, nu=143, vpv=200.0, r=200, expected=SumsOfSquares.independent(143, 200),
+                rho=1.0, log_rho_mean=-0.006, log_rho_sd=0.08,
                 coverage=0.95, points_used=50,
                 pits={"t": 0.5, "s0_squared": 0.5, "f": 0.5, "rho": 0.5}, predicted={"used": 2e-5}, achieved=2e-5,
                 errors=errors,
@@ -142,6 +167,7 @@ def test_the_file_gives_back_the_same_campaign(right):
     direct = member_of("3", validation)
     assert again.t_sum == direct.t_sum
     assert again.pits == direct.pits
+    assert again.expected == direct.expected
     np.testing.assert_allclose(again.errors, direct.errors, rtol=1e-12)
     json.dumps(plain(campaign_payload(pool([again, *right]))), allow_nan=False)
 

@@ -3,6 +3,7 @@
 One network cannot confirm a prediction to 10 %; K of them can. Pooled over networks, realisations independent:
 
     T = Σ Tᵢ ~ chi²(Σ nuᵢ),   v'Pv = Σ ~ chi²(Σ rᵢ),   F = (T/Σnu) / (v'Pv/Σr) ~ F(Σnu, Σr)
+    (where image points correlate: scaled, with fewer degrees of freedom; ``statistics.SumsOfSquares``)
     PIT of every statistic uniform (Kolmogorov-Smirnov)
     geometric mean of rho over its expectation, slope of log achieved against log predicted
 
@@ -23,7 +24,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import f, kendalltau, kstest, t
 
-from netdesign.adjustment.statistics import chi2_interval, f_interval
+from netdesign.adjustment.statistics import SumsOfSquares, chi2_interval, f_interval
 from netdesign.errors import InfeasibleError
 from netdesign.model.adjustment import Interval, Validation
 from netdesign.model.arrays import Floats
@@ -38,7 +39,7 @@ class Member:
     """What one validated network gives to the campaign.
 
     Attributes:
-        name: of the network.  t_sum, nu, vpv, r: its sums.
+        name: of the network.  t_sum, nu, vpv, r: its sums.  expected: what they are when the prediction is right.
         rho: its RMS ratio.  log_rho_mean, log_rho_sd: of log rho when the prediction is right.
         pits: of "t", "s0_squared", "f" and "rho".
         predicted ("limited", "total", "used"), achieved: RMS, m.
@@ -51,6 +52,7 @@ class Member:
     nu: float
     vpv: float
     r: float
+    expected: SumsOfSquares
     rho: float
     log_rho_mean: float
     log_rho_sd: float
@@ -97,7 +99,7 @@ class Campaign:
     Attributes:
         members: networks pooled.  t, s0_squared, f: pooled statistics with exact intervals.
         rho: geometric mean of achieved / predicted from the observations used, each over its expectation and weighted
-            with its precision; root_f: square root of the pooled F.
+            with its precision; root_f: square root of the pooled F over its expectation.
         against: the same of achieved / predicted for "limited", "total" and "used".
         plain: plain geometric mean of the same, and what it is "expected" to be and the "sd" of its logarithm when all
             predictions are right.
@@ -136,6 +138,7 @@ def member_of(name: str, validation: Validation) -> Member:
         nu=sums["nu"],
         vpv=sums["vpv"],
         r=sums["r"],
+        expected=SumsOfSquares.kept(sums),
         rho=validation.rho.value,
         log_rho_mean=validation.log_rho_mean,
         log_rho_sd=validation.log_rho_sd,
@@ -163,8 +166,10 @@ def pool(members: Sequence[Member], level: float = LEVEL) -> Campaign:
         raise InfeasibleError("campaign: no network was adjusted, nothing to pool")
     nu, r = sum(m.nu for m in members), sum(m.r for m in members)
     t_mean, s0 = sum(m.t_sum for m in members) / nu, sum(m.vpv for m in members) / r
-    ratio = t_mean / s0
-    low, high = f.ppf([0.05, 0.95], nu, r)
+    expected_sum = SumsOfSquares.pooled([m.expected for m in members])
+    t_expected, s0_expected = expected_sum.t_mean / nu, expected_sum.v_mean / r
+    ratio = t_mean / s0 / (t_expected / s0_expected)
+    low, high = f.ppf([0.05, 0.95], *expected_sum.ratio_dofs)
     root_f = Band(
         value=float(np.sqrt(ratio)),
         low=float(np.sqrt(ratio / high)),
@@ -186,9 +191,9 @@ def pool(members: Sequence[Member], level: float = LEVEL) -> Campaign:
     equivalent = rho.equivalent and root_f.equivalent
     return Campaign(
         members=len(members),
-        t=chi2_interval(t_mean, int(nu), level),
-        s0_squared=chi2_interval(s0, int(r), level),
-        f=f_interval(ratio, int(nu), int(r), level),
+        t=chi2_interval(t_mean, expected_sum.t_dof, level, t_expected),
+        s0_squared=chi2_interval(s0, expected_sum.v_dof, level, s0_expected),
+        f=f_interval(t_mean / s0, *expected_sum.ratio_dofs, level, t_expected / s0_expected),
         rho=rho,
         root_f=root_f,
         against={name: float(np.exp(np.average(logs - expected, weights=weight))) for name, logs in ratios.items()},

@@ -107,7 +107,7 @@ def compare(
         rho=rho,
         coverage=sampled_interval(inside, inside_draws, level),
         nees=sampled_interval(nees, nees_draws, level),
-        sums={"t": t_sum, "nu": float(nu), "vpv": s0_squared * r, "r": float(r)},
+        sums={"t": t_sum, "nu": float(nu), "vpv": s0_squared * r, "r": float(r), **expected.moments},
         nu_eff=float(values.sum() ** 2 / (values**2).sum()),
         log_rho_mean=log_mean,
         log_rho_sd=log_sd,

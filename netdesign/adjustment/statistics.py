@@ -8,6 +8,7 @@ Moment approximations
 (Satterthwaite, Liu-Tang-Zhang) miss the lower tail and are not used.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,6 +97,9 @@ def log_rms_moments(weights: Floats) -> tuple[float, float]:
     return -0.5 * first, 0.5 * float(np.sqrt(max(variance, 0.0)))
 
 
+MOMENTS = ("t_mean", "t_variance", "v_mean", "v_variance", "common")
+
+
 @dataclass(frozen=True, kw_only=True)
 class SumsOfSquares:
     """Mean and variance of T = dᵀMd and V = vᵀPv where the errors of image points are correlated, and their covariance.
@@ -114,6 +118,23 @@ class SumsOfSquares:
     def independent(nu: int, r: int) -> "SumsOfSquares":
         """Return those of independent errors."""
         return SumsOfSquares(t_mean=nu, t_variance=2.0 * nu, v_mean=r, v_variance=2.0 * r, common=0.0)
+
+    @staticmethod
+    def kept(sums: Mapping[str, float]) -> "SumsOfSquares":
+        """Return those among the sums of a validation; of one kept without them, those of independent errors."""
+        if "t_mean" not in sums:
+            return SumsOfSquares.independent(int(sums["nu"]), int(sums["r"]))
+        return SumsOfSquares(**{name: sums[name] for name in MOMENTS})
+
+    @staticmethod
+    def pooled(parts: "Sequence[SumsOfSquares]") -> "SumsOfSquares":
+        """Return those of the sums over independent realisations: means and variances add."""
+        return SumsOfSquares(**{name: sum(getattr(part, name) for part in parts) for name in MOMENTS})
+
+    @property
+    def moments(self) -> dict[str, float]:
+        """All five by name, as they are kept in files."""
+        return {name: float(getattr(self, name)) for name in MOMENTS}
 
     @property
     def t_dof(self) -> float:

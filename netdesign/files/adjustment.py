@@ -8,6 +8,7 @@ import numpy as np
 from netdesign.adjustment.absolute import Absolute
 from netdesign.adjustment.campaign import Band, Campaign, Member
 from netdesign.adjustment.lengths import LengthTest
+from netdesign.adjustment.statistics import SumsOfSquares
 from netdesign.model.adjustment import Adjustment, Interval, Validation
 from netdesign.photogrammetry.collinearity import INTRINSIC_NAMES
 from netdesign.photogrammetry.reliability import external_reliability, minimal_detectable_error
@@ -201,6 +202,7 @@ def campaign_member(name: str, record: dict[str, Any]) -> Member:
         nu=sums["nu"],
         vpv=sums["vpv"],
         r=sums["r"],
+        expected=SumsOfSquares.kept(sums),
         rho=statistics["rho"]["value"],
         log_rho_mean=record["log_rho_expected"]["mean"],
         log_rho_sd=record["log_rho_expected"]["sd"],

@@ -197,7 +197,7 @@ class Validation:
         achieved_rms: root mean square of ``errors``, m.
         t, s0_squared, f, rho: the statistics of the network: full covariance, image noise, geometry alone, RMS ratio.
         coverage, nees: share of points inside their 95 % ellipsoid, and mean normalised squared error over 3.
-        sums: T, nu, v'Pv, r: what a campaign pools.  level: of the intervals.
+        sums: T, nu, v'Pv, r and their moments: what a campaign pools.  level: of the intervals.
         nu_eff: effective degrees of freedom of rho, (Σλ)² / Σλ².
         log_rho_mean, log_rho_sd: mean and standard deviation of log rho when the prediction is right.
         passed: T, F and rho inside their intervals.  reasons: why not, in words.

@@ -18,7 +18,7 @@ from netdesign.photogrammetry.connectivity import listed
 from netdesign.photogrammetry.seating import gap_to_surface
 from netdesign.placement.coverage import Coverage, coverage
 from netdesign.placement.distances import named_ends
-from netdesign.placement.preparation import free_slots, pinned_viewpoints
+from netdesign.placement.preparation import free_slots, joint_map_of
 
 RARELY_SEEN = 0.05
 ON_SURFACE = 0.2  # of an edge: a flat tag on a cylinder whose diameter is twice its edge stays below (0.12)
@@ -42,21 +42,20 @@ def check_study(path: Path, progress: Progress = silent) -> Findings:
     task = load_task(path)
     named_ends(task)
     free_slots(task)
-    if task.study.motion != "workspace":
-        pinned_viewpoints(task)
     progress("check", 1, 3, "visibility")
     seen = coverage(task)
     progress("check", 2, 3, "robot")
-    reach = (
-        None
-        if task.cell is None or task.sphere.depth is not None
-        else JointMap.build(task.cell, task.sphere, task.scene.part).share(task.sphere.elevation)
-    )
-    progress("check", 3, 3)
+    reach = None if task.cell is None else JointMap.build(task.cell, task.sphere, task.scene.part).share()
     problems = list(seen.obstacles)
-    if reach is not None and reach["free"] == 0.0:
+    try:
+        joint_map_of(task)
+    except InfeasibleError as error:
+        problems.append(str(error))
+    progress("check", 3, 3)
+    if reach is not None and reach["free"] == 0.0 and task.study.motion != "workspace":
         worst = max((name for name in reach if name != "free"), key=lambda name: reach[name])
-        problems.append(f"the robot reaches no viewpoint of the sphere (mostly: {worst}, {reach[worst]:.0%} of it)")
+        where = "of the sphere" if task.sphere.depth is None else "that is admissible"
+        problems.append(f"the robot reaches no viewpoint {where} (mostly: {worst}, {reach[worst]:.0%} of them)")
     gaps = _gaps(task)
     record = _record(task, seen, reach, problems, gaps)
     if problems and gaps:
@@ -159,6 +158,6 @@ def _text(record: dict[str, Any]) -> str:
         )
     if record["robot"] is not None:
         parts = "  ".join(f"{name} {share:.1%}" for name, share in record["robot"].items() if share > 0)
-        lines.append(f"robot      {parts} of the sphere")
+        lines.append(f"robot      {parts} of the {place}")
     lines.append("feasible   nothing is proved against it" if not record["problems"] else "infeasible")
     return "\n".join(lines)

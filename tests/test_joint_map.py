@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from netdesign.motion.collision import FREE, REASONS, states
-from netdesign.motion.joint_map import JointMap, solve_closed
+from netdesign.motion.inverse import rest_of, solve_closed
+from netdesign.motion.joint_map import JointMap
 from netdesign.motion.kinematics import into_limits
 from netdesign.motion.plan import plan_on
 from tests.cells import PART, arm, cell, joint_map, reachable_viewpoints, viewpoints
@@ -26,7 +27,7 @@ def test_the_share_of_the_map_is_just_below_the_exact_one():
     of_map = joint_map("coaxial", roll=None, elevation=(0, 90))
     drawn = of_map.lattice(samples=4000)
     solved, found = solve_closed(of_map.arm, of_map.sphere.cameras(drawn, of_map.rolls[0]))
-    solved[..., -1] = of_map.rest
+    solved[..., -1] = rest_of(of_map.arm)
     placed, free = of_map.arm.placed, np.zeros(len(drawn), dtype=np.bool_)
     for branch in range(found.shape[1]):
         rows = np.flatnonzero(found[:, branch])

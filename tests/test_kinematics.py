@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from netdesign.model.frames import pose
-from netdesign.motion.joint_map import solve_closed
+from netdesign.motion.inverse import solve_closed
 from netdesign.motion.joint_sheets import free_joints
 from netdesign.motion.kinematics import base_from_flange, into_limits, restarts, solve
 from netdesign.motion.robot import load_chain

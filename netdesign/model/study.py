@@ -264,11 +264,6 @@ class Study(Table):
     def _motion_needs_a_robot(self) -> "Study":
         if self.robot is None and self.objectives.motion in ("joint", "time"):
             raise ValueError(f"objectives.motion: {self.objectives.motion} needs a [robot] table")
-        if self.motion != "workspace" and not isinstance(self.viewpoints.radius_mm, float | int):
-            raise ValueError(
-                f"viewpoints: expected one radius_mm for motion = {self.motion!r}, found a range or another shape;"
-                ' set objectives.motion = "workspace" (the robot is then not asked)'
-            )
         return self
 
     @property

@@ -106,7 +106,7 @@ def load_arm(cell: RobotCell, sphere: ViewingSphere, part: Part) -> ArmCell:
         field_origin=field_origin,
         field_step=field_step,
         margin=cell.margin,
-        sight=np.stack([share, share * min(reach, 0.5 * sphere.radius)], axis=1),
+        sight=np.stack([share, share * reach], axis=1),
         centre=np.array(sphere.centre),
     )
     body, loose = _without_false_alarms(body, meshes, placed)

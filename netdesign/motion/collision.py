@@ -44,8 +44,8 @@ class Body(NamedTuple):
     boxes (b, 6): centre and half edge lengths; mounting (b,): the base stands on it, so link 1 is not tested against
     it and link 2 without the margin. field (x, y, z): lower bound of the distance to the part at the centre of each
     cell; field_origin (3,): centre of cell 0; field_step: edge of a cell.
-    margin: kept from part and obstacles. sight (k, 2): share of the way from camera to centre, radius that must be
-    clear there; centre (3,): what the camera looks at.
+    margin: kept from part and obstacles. sight (k, 2): share of the line of sight, as long as the centre is far, and
+    the radius that must be clear there, never more than half of the way; centre (3,) of the stations.
     """
 
     placements: Floats
@@ -218,13 +218,17 @@ def configuration_state(body, q, links, placed):  # type: ignore[no-untyped-def]
             return SELF
     camera = np.empty((3, 4))
     flange_of(links[r - 1], body.last_from_cam, camera)
-    ball = np.empty(6)
+    ball, far = np.empty(6), 0.0
+    for a in range(3):
+        far += (body.centre[a] - camera[a, 3]) ** 2
+    far = math.sqrt(far)
     for k in range(body.sight.shape[0]):
+        way = body.sight[k, 0] * far
         for a in range(3):
-            ball[a] = camera[a, 3] + body.sight[k, 0] * (body.centre[a] - camera[a, 3])
+            ball[a] = camera[a, 3] + way * camera[a, 2]
             ball[a + 3] = ball[a]
         for c in range(count - body.camera_parts):
-            radius = body.capsules[c, 6] + body.sight[k, 1]
+            radius = body.capsules[c, 6] + min(body.sight[k, 1], 0.5 * way)
             if _segment_segment(placed[c], ball) < radius * radius:
                 return SIGHT
     return FREE

@@ -227,6 +227,16 @@ def directions_tour(directions):  # type: ignore[no-untyped-def]
     return tour
 
 
+@entry()
+def options_tour(options, count, directions, label, barred, law, timed, work):  # type: ignore[no-untyped-def]
+    """Return the search's joint tour of n >= 1 stations whose options (n, r, K) are known, without dwell.
+
+    It starts from the order that goes to the nearest of the unit directions (n, 3).
+    """
+    tour = directions_tour(directions)
+    return joint_tour(options, count, label, barred, law, timed, tour, np.int64(_ROUNDS), work)
+
+
 class SearchWork(NamedTuple):
     """Scratch of ``network_tour``, from ``search_work_for``."""
 
@@ -265,8 +275,7 @@ def network_tour(arrays, law, timed, dwell, viewpoints, own, work):  # type: ign
     refused = n - kept
     length = 0.0
     if kept > 1:
-        tour = directions_tour(own.directions[:kept])
-        length = joint_tour(
-            own.options[:kept], own.count[:kept], own.label, own.barred, law, timed, tour, np.int64(_ROUNDS), work
+        length = options_tour(
+            own.options[:kept], own.count[:kept], own.directions[:kept], own.label, own.barred, law, timed, work
         )
     return (length + dwell * n if timed else length), refused

@@ -86,10 +86,12 @@ class Legs:
         return not (self._arm.loose and self._arm.meshes.leg_contact(start, end, _STEP))
 
     def _candidates(self, middle: Floats) -> Floats:
-        arrays, placed = self._map.arrays, self._arm.placed
-        step = max(arrays.state.shape[1] // 12, 1)
-        state = arrays.state[:: max(len(arrays.state) // 4, 1), ::step, ::step]
-        joints = arrays.joints[:: max(len(arrays.state) // 4, 1), ::step, ::step][state == FREE].astype(np.float64)
+        placed, found = self._arm.placed, []
+        for arrays in self._map.shells:
+            step, rolls = max(arrays.state.shape[1] // 12, 1), max(len(arrays.state) // 4, 1)
+            free = arrays.state[::rolls, ::step, ::step] == FREE
+            found.append(arrays.joints[::rolls, ::step, ::step][free])
+        joints = np.concatenate(found).astype(np.float64)
         turned = joints + np.where(placed.wraps, _TURN * np.rint((middle - joints) / _TURN), 0.0)
         inside = (turned >= placed.lower) & (turned <= placed.upper)
         return np.ascontiguousarray(np.where(inside, turned, joints))

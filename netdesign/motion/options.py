@@ -1,6 +1,7 @@
 """Exact joint options of the stations of a plan: every branch at every roll, solved to the pose, tested, and lifted."""
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,12 +9,16 @@ import numpy as np
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.motion.cell import ArmCell
 from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION, REASONS, states
+from netdesign.motion.inverse import rest_of, solve_closed, tested
 from netdesign.motion.joint_lookup import LANES
-from netdesign.motion.joint_map import JointMap, solve_closed
+from netdesign.motion.joint_map import JointMap
 from netdesign.motion.joint_sheets import free_joints
-from netdesign.motion.kinematics import into_limits, refine
+from netdesign.motion.kinematics import into_limits, refine, restarts
 
 PLAN_ROLLS = 24
+NO_POSES = np.zeros((0, 4, 4))
+_POSE_STARTS = 100  # of the numerical solution at a pose anywhere
+_SAME = 1e-6  # rad
 _TURN = 2.0 * np.pi
 
 
@@ -37,13 +42,15 @@ class StationOptions:
         return self.joints[station][:, chosen].T, self.label[station, chosen]
 
 
-def exact_options(joint_map: JointMap, viewpoints: Floats) -> StationOptions:
-    """Return the exact options of viewpoints (n, 2): closed form, or refined from the sheets of the map.
+def exact_options(joint_map: JointMap, viewpoints: Floats, given: Floats = NO_POSES) -> StationOptions:
+    """Return the exact options of poses ``given`` (e, 4, 4), then of viewpoints (n, 2 or 3) of the map's sphere.
 
-    A station that capsules leave without an option is tested again with the real meshes.
+    Closed form, or refined from the sheets of the map. A given pose keeps its roll. A station that capsules leave
+    without an option is tested again with the real meshes.
     """
     solve = _closed_options if joint_map.arm.ur is not None else _sheet_options
-    found = [solve(joint_map, viewpoint) for viewpoint in viewpoints]
+    found = [_options_of_pose(joint_map, pose) for pose in given]
+    found += [solve(joint_map, viewpoint) for viewpoint in viewpoints]
     arm = joint_map.arm
     kept: list[tuple[Floats, Ints]] = []
     refused: list[tuple[int, str]] = []
@@ -109,20 +116,57 @@ def _rolls(joint_map: JointMap) -> Floats:
     return np.arange(count, dtype=np.float64) * (_TURN / count)
 
 
-def _closed_options(joint_map: JointMap, viewpoint: Floats) -> tuple[Floats, Ints, str]:
-    """Return joints (k, 6) inside the limits, their branch labels (k,), and why there are none."""
-    sphere, placed = joint_map.sphere, joint_map.arm.placed
-    rolls = _rolls(joint_map)
-    targets = sphere.cameras(np.tile(viewpoint, (len(rolls), 1)), rolls)
-    solved, found = solve_closed(joint_map.arm, targets)
-    if joint_map.follows:
-        solved[..., -1] = joint_map.rest
+def search_options(joint_map: JointMap, viewpoints: Floats) -> list[Floats]:
+    """Return the joints (k, r) that capsules call free of each of viewpoints (n, 2 or 3), at the rolls of a search.
+
+    What a map tells by interpolation, for stations without a map: solved exactly, none left out.
+    """
+    arm, sphere, rolls = joint_map.arm, joint_map.sphere, joint_map.rolls
+    if arm.ur is None:
+        solved = [_sheet_options(joint_map, viewpoint)[0] for viewpoint in viewpoints]
+        return [joints[states(arm.body, joints) == FREE] if len(joints) else joints for joints in solved]
+    targets = sphere.cameras(np.repeat(viewpoints, len(rolls), axis=0), np.tile(rolls, len(viewpoints)))
+    joints, found = solve_closed(arm, targets)
+    free = tested(arm, joints, found, rest_of(arm) if joint_map.follows else math.nan) == FREE
+    shape = (len(viewpoints), -1, joints.shape[-1])
+    return [q[kept] for q, kept in zip(joints.reshape(shape), free.reshape(shape[:2]), strict=True)]
+
+
+def _options_of_pose(joint_map: JointMap, pose: Floats) -> tuple[Floats, Ints, str]:
+    """Return joints (k, r) inside the limits at a pose (4, 4) anywhere, their labels (k,), and why there are none."""
+    arm, placed = joint_map.arm, joint_map.arm.placed
+    if arm.ur is not None:
+        return _inside(arm, *solve_closed(arm, pose[None]))
+    found: list[Floats] = []
+    for start in restarts(placed, _POSE_STARTS):
+        q = start.copy()
+        if refine(
+            placed.placements, placed.last_from_flange, placed.lower, placed.upper, placed.wraps,
+            np.ones(len(placed), np.bool_), pose, q,
+        ) and not any(np.abs(q - other).max() < _SAME for other in found):  # fmt: skip
+            found.append(q)
+    joints = np.array(found).reshape(-1, len(placed))
+    return joints, np.arange(len(joints)), REASONS[NO_SOLUTION]
+
+
+def _inside(arm: ArmCell, solved: Floats, found: Bools) -> tuple[Floats, Ints, str]:
+    """Return the joints (k, 6) inside the limits among solved (n, 8, 6), their branches (k,), why none."""
     label = np.broadcast_to(np.arange(found.shape[1]), found.shape)[found]
     joints = np.ascontiguousarray(solved[found])
     if not len(joints):
-        return joints.reshape(0, len(placed)), label, REASONS[NO_SOLUTION]
-    inside = np.array([into_limits(q, placed.lower, placed.upper) for q in joints])
+        return joints.reshape(0, len(arm.placed)), label, REASONS[NO_SOLUTION]
+    inside = np.array([into_limits(q, arm.placed.lower, arm.placed.upper) for q in joints])
     return joints[inside], label[inside], REASONS[LIMITS]
+
+
+def _closed_options(joint_map: JointMap, viewpoint: Floats) -> tuple[Floats, Ints, str]:
+    """Return joints (k, 6) inside the limits, their branch labels (k,), and why there are none."""
+    rolls = _rolls(joint_map)
+    targets = joint_map.sphere.cameras(np.tile(viewpoint, (len(rolls), 1)), rolls)
+    solved, found = solve_closed(joint_map.arm, targets)
+    if joint_map.follows:
+        solved[..., -1] = rest_of(joint_map.arm)
+    return _inside(joint_map.arm, solved, found)
 
 
 def _sheet_options(joint_map: JointMap, viewpoint: Floats) -> tuple[Floats, Ints, str]:

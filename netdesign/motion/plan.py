@@ -26,7 +26,7 @@ from netdesign.motion.joint_map import JointMap
 from netdesign.motion.joint_tour import NO_TURN, directions_tour, joint_tour, law_of, legs_along, work_for
 from netdesign.motion.kinematics import forward
 from netdesign.motion.legs import Legs, home_legs, turned_towards
-from netdesign.motion.options import StationOptions, exact_options, lifted
+from netdesign.motion.options import NO_POSES, StationOptions, exact_options, lifted
 from netdesign.motion.tour import open_path
 
 _ROUNDS = 20
@@ -100,13 +100,22 @@ def plan(
     return plan_on(JointMap.build(cell, sphere, part), viewpoints, motion, seed)
 
 
-def plan_on(joint_map: JointMap, viewpoints: Floats, motion: Literal["joint", "time"] = "joint", seed: int = 0) -> Plan:
-    """Return the motion of the arm over viewpoints (n, 2) = (alpha, beta) rad, n >= 1, in the best order found.
+def plan_on(
+    joint_map: JointMap,
+    viewpoints: Floats,
+    motion: Literal["joint", "time"] = "joint",
+    seed: int = 0,
+    given: Floats = NO_POSES,
+) -> Plan:
+    """Return the motion of the arm over n >= 1 stations in the best order found.
 
-    The tour's length is the sum of the driven legs: weighted rad, or s with the dwell at every station.
+    Stations: poses ``given`` (e, 4, 4) world_from_cam, anywhere, which are kept, roll included; then viewpoints
+    (n - e, 2 or 3) of the map's sphere. The tour's length is the sum of the driven legs: weighted rad, or s with the
+    dwell at every station.
     """
     viewpoints = np.ascontiguousarray(viewpoints, dtype=np.float64)
-    options = exact_options(joint_map, viewpoints)
+    options = exact_options(joint_map, viewpoints, given)
+    viewpoints = np.concatenate([joint_map.sphere.placed(given)[0], viewpoints[:, :2]])
     if options.refused:
         return Plan(tour=None, world_from_cam=np.zeros((0, 4, 4)), viewpoints=np.zeros((0, 2)), refused=options.refused)
     arm, timed = joint_map.arm, motion == "time"

@@ -152,8 +152,7 @@ class Exact:
         poses = self.problem.poses(viewpoints)
         if self.problem.joint_map is not None:
             motion: Literal["joint", "time"] = "time" if task.study.motion == "time" else "joint"
-            everything = np.concatenate([task.sphere.placed(task.existing)[0], viewpoints])
-            plan = plan_on(self.problem.joint_map, everything, motion, task.study.seed)
+            plan = plan_on(self.problem.joint_map, viewpoints, motion, task.study.seed, task.existing)
             if plan.tour is None:
                 return f"a station the robot cannot take ({', '.join(sorted({reason for _, reason in plan.refused}))})"
             return plan.world_from_cam, plan.tour, plan.warnings

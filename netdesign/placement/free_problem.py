@@ -1,12 +1,11 @@
 """Stations that are not on one sphere: a range of radii, an ellipsoid, a box, or existing ones anywhere.
 
-No map of the visible can be drawn once and for all here, so every station is looked at with exact rays when it first
-appears, and what it adds to every point's normal matrix is kept: limited propagation adds up image by image. Children
-share most stations with their parents, and the local search changes one at a time.
+No map of the visible can be drawn once and for all here: every station is looked at when it first appears
+(``known_stations``), and limited propagation adds up what the images contribute.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,22 +13,20 @@ from netdesign.model.arrays import Bools, Floats
 from netdesign.model.progress import Progress, silent
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
-from netdesign.motion.tour import path_length
 from netdesign.photogrammetry.connectivity import loose_images
 from netdesign.photogrammetry.limited_error import WEAK, variances_of
-from netdesign.photogrammetry.visibility import Sight
 from netdesign.placement.bound import lower_bounds
 from netdesign.placement.distances import named_ends
 from netdesign.placement.encoding import Chromosomes
 from netdesign.placement.evaluation import excess
+from netdesign.placement.known_stations import KnownStations, Station
 from netdesign.placement.network_problem import ADDITIONS, MOVES, REMOVALS, TELEPORTS, NetworkProblem
-from netdesign.placement.optimal_design import information_of
 from netdesign.placement.preparation import datum_gauge, demanded_cover, free_slots, hypervolume_scale, on_sphere
 from netdesign.placement.problem import Problem
 from netdesign.placement.set_cover import CANDIDATES, Cover
 from netdesign.search.population import Population
 
-KEPT = 20_000  # stations whose sightings are remembered
+MM = 1e-3
 ROUNDS = 5  # of the local search: a fifth of the moves at once, the best of them is where the next start
 
 
@@ -40,33 +37,25 @@ def problem_of(task: Task, progress: Progress = silent) -> NetworkProblem:
         InputError: [requirements] names unknown points, or existing stations do not fit the study.
         InfeasibleError: some tag can be seen from nowhere, or no station sees enough.
     """
-    if task.study.motion == "workspace" and (task.sphere.depth is not None or not on_sphere(task)):
+    if task.sphere.depth is not None or not on_sphere(task):
         return FreeProblem.build(task, progress)
-    return Problem.build(task, progress)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Station:
-    """What one image adds: the tags that it sees (g,), its part (m, 6) of the normal matrices, its place (3,) m."""
-
-    sees: Bools
-    normal: Floats
-    place: Floats
+    problem = Problem.build(task, progress)
+    if not problem.reachable(problem.pinned).all():  # at the edge of what a map can tell
+        return FreeProblem.build(task, progress)
+    return problem
 
 
 @dataclass(frozen=True, kw_only=True)
 class FreeProblem(NetworkProblem):
-    """A study with stations anywhere in the admissible body, motion in the workspace.
+    """A study with stations anywhere in the admissible body.
 
     Attributes:
-        sight: the scene, prepared for rays.  fixed: the existing stations.  limit: longest admissible tour, m.
-        known: stations looked at so far, by the bytes of their genes; it changes no result.
+        stations: what is known of them.  fixed: the existing ones.  limit: longest admissible tour, in the unit of f2.
     """
 
-    sight: Sight
+    stations: KnownStations
     fixed: tuple[Station, ...]
     limit: float
-    known: dict[bytes, Station] = field(default_factory=dict)
 
     @staticmethod
     def build(task: Task, progress: Progress = silent) -> "FreeProblem":
@@ -74,12 +63,17 @@ class FreeProblem(NetworkProblem):
         named_ends(task)
         slots = free_slots(task)
         progress("set cover", 0, 1)
-        sight, asked = Sight(task.scene, task.camera, task.limits), task.study.requirements.max_tour
+        known, asked = KnownStations.build(task), task.study.requirements.max_tour
+        unit = MM if task.study.motion == "workspace" else 1.0
+
+        def tours(networks: Floats) -> Floats:
+            return np.array([known.tour(known.of(viewpoints))[0] for viewpoints in networks])
+
         empty = Cover(viewpoints=np.zeros((0, task.sphere.genes)), candidates=0, least=0)
         problem = FreeProblem(
             task=task, chromosomes=Chromosomes(sphere=task.sphere, slots=slots), cover=empty,
-            scale=hypervolume_scale(task, None, slots), gauge=datum_gauge(task), sight=sight,
-            fixed=_looked_at(task, sight, task.existing), limit=np.inf if asked is None else 1e-3 * asked,
+            scale=hypervolume_scale(task, slots, tours), gauge=datum_gauge(task), joint_map=known.joint_map,
+            stations=known, fixed=known.existing(), limit=np.inf if asked is None else unit * asked,
         )  # fmt: skip
         stations = problem.candidates()
         already = problem.existing_sees.sum(axis=0)
@@ -99,15 +93,22 @@ class FreeProblem(NetworkProblem):
         return objectives[:, 0], violation
 
     def candidates(self) -> Floats:
-        """Return viewpoints (c, d) all over the admissible set that see enough for an image."""
+        """Return viewpoints (c, d) all over the admissible set, within reach, that see enough for an image."""
         viewpoints = self.chromosomes.spread(CANDIDATES)
+        viewpoints = viewpoints[self.reachable(viewpoints)]
         enough = self.sees(viewpoints).sum(axis=1) * CORNERS_PER_TAG >= max(self.task.limits.min_points_per_image, 1)
         return np.asarray(viewpoints[enough])
 
     def sees(self, viewpoints: Floats) -> Bools:
         """Return (k, g) the tags that are seen from viewpoints (k, d): exact."""
-        found = [station.sees for station in self._stations(viewpoints)]
+        found = [station.sees for station in self.stations.of(viewpoints)]
         return np.array(found, np.bool_).reshape(len(found), len(self.task.scene.targets.ids))
+
+    def reachable(self, viewpoints: Floats) -> Bools:
+        """Return (k,) whether the arm can take viewpoints (k, d); all of them when motion is in the workspace."""
+        if self.joint_map is None:
+            return np.ones(len(viewpoints), np.bool_)
+        return np.array([len(station.joints) > 0 for station in self.stations.of(viewpoints)], np.bool_)
 
     def bounds(self, sizes: Iterable[int]) -> dict[int, float]:
         """Return proven lower bounds on f1 by number of images; empty where nothing is proved."""
@@ -182,7 +183,7 @@ class FreeProblem(NetworkProblem):
     def _evaluated(self, bits: Bools, genes: Floats, tours: bool) -> tuple[Floats, Floats]:
         objectives, violation = np.full((len(bits), 3), np.inf), np.zeros(len(bits))
         limits, constraint = self.task.limits, self.task.sphere.admissible(genes)
-        stations = iter(self._stations(genes[bits]))
+        stations = iter(self.stations.of(genes[bits]))
         worst = self.task.study.objectives.precision == "max_sigma"
         for row, chosen in enumerate(bits):
             own = [next(stations) for _ in range(int(chosen.sum()))]
@@ -203,40 +204,9 @@ class FreeProblem(NetworkProblem):
             variances = variances_of(np.sum([station.normal for station in network], axis=0), WEAK)
             weak = np.isinf(variances[:, 0]).sum()
             objectives[row, 0] = np.sqrt(variances.max()) if worst else variances.mean()
-            objectives[row, 1] = path_length(np.array([station.place for station in network])) if tours else 0.0
-            violation[row] = weak + excess(objectives[row, 1], self.limit)
+            objectives[row, 1], refused = self.stations.tour(network) if tours else (0.0, 0)
+            violation[row] = weak + refused + excess(objectives[row, 1], self.limit)
         return objectives, violation
-
-    def _stations(self, viewpoints: Floats) -> list[Station]:
-        """The stations of viewpoints (k, d); those that are new are looked at together."""
-        keys = [viewpoint.tobytes() for viewpoint in np.ascontiguousarray(viewpoints)]
-        new = list({key: row for row, key in enumerate(keys) if key not in self.known}.values())
-        if len(self.known) + len(new) > KEPT:
-            self.known.clear()
-            new = list({key: row for row, key in enumerate(keys)}.values())
-        there = self.task.sphere.admissible(viewpoints[new])
-        poses = self.task.sphere.cameras(viewpoints[new][there])
-        looked = iter(_looked_at(self.task, self.sight, poses))
-        nothing = Station(
-            sees=np.zeros(len(self.task.scene.targets.ids), np.bool_),
-            normal=np.zeros((len(self.task.scene.targets.points), 6)),
-            place=self.task.sphere.centre,
-        )
-        for row, real in zip(new, there.tolist(), strict=True):
-            self.known[keys[row]] = next(looked) if real else nothing
-        return [self.known[key] for key in keys]
-
-
-def _looked_at(task: Task, sight: Sight, poses: Floats) -> tuple[Station, ...]:
-    """What images with poses (k, 4, 4) see and add."""
-    if not len(poses):
-        return ()
-    sees = sight.look(poses).visible_tags
-    normal = information_of(task, poses, np.repeat(sees, CORNERS_PER_TAG, axis=1)).reshape(len(poses), -1, 6)
-    places = poses[:, :3, 3]
-    return tuple(
-        Station(sees=tags, normal=part, place=place) for tags, part, place in zip(sees, normal, places, strict=True)
-    )
 
 
 def _preferred(preference: Floats, objectives: Floats) -> Floats:

@@ -35,7 +35,7 @@ def why_infeasible(problem: NetworkProblem, state: State) -> str:
     if loose:
         parts.append(f"{loose} of {len(viewpoints)} images share no object point with the others{_groups(problem)}")
     if problem.joint_map is not None:
-        refused = (~problem.joint_map.reachable(viewpoints)).sum()
+        refused = (~problem.reachable(viewpoints)).sum()
         if refused:
             parts.append(f"{refused} of {len(viewpoints)} stations are out of the robot's reach")
     if not parts and task.study.requirements.max_tour is not None:

@@ -61,6 +61,10 @@ class NetworkProblem(ABC):
         """Return (k, g) the tags that are seen from viewpoints (k, d) for certain."""
 
     @abstractmethod
+    def reachable(self, viewpoints: Floats) -> Bools:
+        """Return (k,) whether the arm can take viewpoints (k, d); all of them when motion is in the workspace."""
+
+    @abstractmethod
     def bounds(self, sizes: Iterable[int]) -> dict[int, float]:
         """Return proven lower bounds on f1 by number of images; empty where nothing is proved."""
 

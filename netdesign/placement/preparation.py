@@ -1,5 +1,7 @@
 """What a search needs before it starts: the kernels' tables, the set cover, the scales of the hypervolume."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from netdesign.errors import InfeasibleError, InputError
@@ -8,6 +10,7 @@ from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
 from netdesign.motion.joint_tour import law_of
+from netdesign.motion.options import exact_options
 from netdesign.motion.tour import path_length
 from netdesign.photogrammetry.datum import inner_basis
 from netdesign.photogrammetry.limited_error import LANES, blocked
@@ -66,6 +69,25 @@ def sphere_tables(task: Task, visibility: VisibilityMap) -> SphereTables:
         longest=np.inf if longest is None or task.study.motion != "workspace" else 1e-3 * longest,
         limits=np.array([*sphere.azimuth, *sphere.elevation]),
     )
+
+
+def joint_map_of(task: Task) -> JointMap | None:
+    """The joints over a study's stations, None when motion is measured in the workspace.
+
+    Raises:
+        InfeasibleError: the robot cannot take an existing station.
+    """
+    if task.cell is None or task.study.motion == "workspace":
+        return None
+    joint_map = JointMap.build(task.cell, task.sphere, task.scene.part)
+    refused = exact_options(joint_map, np.zeros((0, 2)), task.existing).refused
+    if refused:
+        stations = ", ".join(f"station {index + 1} ({reason})" for index, reason in refused)
+        raise InfeasibleError(
+            f"viewpoints.existing: the robot cannot take {len(refused)} of {len(task.existing)} existing stations:"
+            f' {stations}; objectives.motion = "workspace" leaves the robot out'
+        )
+    return joint_map
 
 
 def joint_tables(task: Task, joint_map: JointMap | None) -> JointTables | None:
@@ -131,21 +153,6 @@ def free_slots(task: Task) -> int:
     return most - len(task.existing)
 
 
-def pinned_viewpoints(task: Task) -> Floats:
-    """Return (e, 2) the viewpoints of the existing stations, which lie on the sphere.
-
-    Raises:
-        InputError: one does not, or it has another roll.
-    """
-    viewpoints, _ = task.sphere.placed(task.existing)
-    if not on_sphere(task):
-        raise InputError(
-            f"viewpoints.existing: expected stations on the viewing sphere, with its roll, for motion ="
-            f' {task.study.motion!r}; set objectives.motion = "workspace" for others'
-        )
-    return viewpoints
-
-
 def on_sphere(task: Task) -> bool:
     """Tell whether every existing station is one of the viewing sphere's cameras (to 1 µm and 1e-5)."""
     if not len(task.existing):
@@ -159,8 +166,17 @@ def on_sphere(task: Task) -> bool:
     return bool(apart[:, :3, 3].max() < 1e-6 and apart[:, :3, :3].max() < 1e-5)
 
 
-def hypervolume_scale(task: Task, joint: JointTables | None, slots: int) -> Floats:
-    """Ideal and reference point of the hypervolume.
+def sphere_tours(task: Task, joint: JointTables | None, networks: Floats) -> Floats:
+    """Return the tours (k,) of the search over networks (k, n, 2) on the sphere, stations out of reach left out."""
+    if joint is None:
+        return np.array([path_length(poses[:, :3, 3]) for poses in task.sphere.cameras(networks)])
+    objectives = np.zeros((len(networks), 3))
+    joint_tours(np.ones(networks.shape[:2], np.bool_), networks, joint, objectives, np.zeros(len(networks)))
+    return objectives[:, 1]
+
+
+def hypervolume_scale(task: Task, slots: int, tours: Callable[[Floats], Floats]) -> Floats:
+    """Ideal and reference point of the hypervolume; tours: of networks (k, n, d), (k,).
 
     log f1 from the closed-form bound of ``slots`` images to 100 times it; f2 from 0 to the longest tour over ``slots``
     random stations in 20 samples; f3 from 1 to slots + 1.
@@ -168,12 +184,7 @@ def hypervolume_scale(task: Task, joint: JointTables | None, slots: int) -> Floa
     camera, slots = task.camera, slots + len(task.existing)
     bound = 1.5 * float(camera.sigma_px**2 / (camera.focal_px**2).mean()) * (task.sphere.radius**2) / slots
     samples = Chromosomes(sphere=task.sphere, slots=slots).uniform(np.random.default_rng(0), (20, slots))
-    if joint is None:
-        longest = max(path_length(poses[:, :3, 3]) for poses in task.sphere.cameras(samples))
-    else:
-        objectives = np.zeros((len(samples), 3))
-        joint_tours(np.ones(samples.shape[:2], np.bool_), samples, joint, objectives, np.zeros(len(samples)))
-        longest = float(objectives[:, 1].max())
+    longest = float(tours(samples).max())
     if task.study.objectives.precision == "max_sigma":
         ideal, reference = 0.5 * np.log(bound), 0.5 * np.log(100 * bound)
     else:

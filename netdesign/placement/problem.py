@@ -11,7 +11,6 @@ import numpy as np
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.progress import Progress, silent
 from netdesign.model.task import Task
-from netdesign.motion.joint_map import JointMap
 from netdesign.placement.bound import lower_bounds
 from netdesign.placement.distances import named_ends
 from netdesign.placement.encoding import LARGEST_STEP, SMALLEST_STEP, Chromosomes
@@ -23,10 +22,11 @@ from netdesign.placement.preparation import (
     demanded_cover,
     free_slots,
     hypervolume_scale,
+    joint_map_of,
     joint_tables,
     lattice_candidates,
-    pinned_viewpoints,
     sphere_tables,
+    sphere_tours,
 )
 from netdesign.placement.tables import JointTables, SphereTables
 from netdesign.placement.visibility_map import VisibilityMap
@@ -60,12 +60,11 @@ class Problem(NetworkProblem):
             InfeasibleError: some tag can be seen from nowhere, or no station the robot reaches sees enough.
         """
         named_ends(task)
-        pinned = pinned_viewpoints(task)
+        pinned, _ = task.sphere.placed(task.existing)
         progress("visibility map", 0, 3)
         visibility = VisibilityMap.build(task.scene, task.camera, task.sphere, task.limits)
         progress("joint map", 1, 3)
-        moving = task.study.motion != "workspace" and task.cell is not None
-        joint_map = JointMap.build(task.cell, task.sphere, task.scene.part) if moving and task.cell else None
+        joint_map = joint_map_of(task)
         progress("set cover", 2, 3)
         tables = sphere_tables(task, visibility)._replace(fixed=len(pinned))
         slots = free_slots(task)
@@ -81,7 +80,7 @@ class Problem(NetworkProblem):
             tables=tables,
             joint=joint,
             cover=cover,
-            scale=hypervolume_scale(task, joint, slots),
+            scale=hypervolume_scale(task, slots, lambda networks: sphere_tours(task, joint, networks)),
             gauge=datum_gauge(task),
             pinned=pinned,
         )
@@ -152,6 +151,12 @@ class Problem(NetworkProblem):
     def sees(self, viewpoints: Floats) -> Bools:
         """Return (k, g) the tags that are seen from the whole cell of each viewpoint (k, 2)."""
         return self.visibility.sure_tags(self.visibility.cell_of(viewpoints))
+
+    def reachable(self, viewpoints: Floats) -> Bools:
+        """Return (k,) whether the arm can take viewpoints (k, 2); all of them when motion is in the workspace."""
+        if self.joint_map is None:
+            return np.ones(len(viewpoints), np.bool_)
+        return self.joint_map.reachable(viewpoints)
 
     def bounds(self, sizes: Iterable[int]) -> dict[int, float]:
         """Return proven lower bounds on f1 by number of images; empty where nothing is proved."""

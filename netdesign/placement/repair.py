@@ -12,6 +12,7 @@ import numpy as np
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
+from netdesign.motion.options import search_options
 from netdesign.photogrammetry.limited_error import variances_of
 from netdesign.photogrammetry.visibility import Sight
 from netdesign.placement.distances import network_total_error
@@ -111,7 +112,7 @@ class Standing:
     def _usable(self, viewpoints: Floats) -> Floats:
         """The viewpoints within reach that see enough for an image."""
         if self.joint_map is not None:
-            viewpoints = viewpoints[self.joint_map.reachable(viewpoints)]
+            viewpoints = viewpoints[[len(joints) > 0 for joints in search_options(self.joint_map, viewpoints)]]
         seen = self.sight.look(self.task.sphere.cameras(viewpoints)).visible.sum(axis=1)
         return np.asarray(viewpoints[seen >= max(self.task.limits.min_points_per_image, 1)])
 

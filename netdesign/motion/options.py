@@ -14,6 +14,7 @@ from netdesign.motion.joint_lookup import LANES
 from netdesign.motion.joint_map import JointMap
 from netdesign.motion.joint_sheets import free_joints
 from netdesign.motion.kinematics import into_limits, refine, restarts
+from netdesign.motion.ur_kinematics import BRANCHES
 
 PLAN_ROLLS = 24
 NO_POSES = np.zeros((0, 4, 4))
@@ -128,7 +129,7 @@ def search_options(joint_map: JointMap, viewpoints: Floats) -> list[Floats]:
     targets = sphere.cameras(np.repeat(viewpoints, len(rolls), axis=0), np.tile(rolls, len(viewpoints)))
     joints, found = solve_closed(arm, targets)
     free = tested(arm, joints, found, rest_of(arm) if joint_map.follows else math.nan) == FREE
-    shape = (len(viewpoints), -1, joints.shape[-1])
+    shape = (len(viewpoints), len(rolls) * BRANCHES, joints.shape[-1])
     return [q[kept] for q, kept in zip(joints.reshape(shape), free.reshape(shape[:2]), strict=True)]
 
 

@@ -134,4 +134,4 @@ class KnownStations:
         offset = self.task.scene.targets.points - poses[:, None, :3, 3]
         inside = offset @ poses[:, :3, :3]
         within = np.hypot(inside[..., 0], inside[..., 1]) <= inner * inside[..., 2]
-        return np.asarray(within.reshape(len(poses), -1, CORNERS_PER_TAG).all(axis=2))
+        return np.asarray(within.reshape(len(poses), len(self.task.scene.targets.ids), CORNERS_PER_TAG).all(axis=2))

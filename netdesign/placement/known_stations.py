@@ -17,9 +17,9 @@ from netdesign.motion.joint_tour import options_tour, work_for
 from netdesign.motion.options import exact_options, search_options
 from netdesign.motion.tour import path_length
 from netdesign.photogrammetry.visibility import Sight
-from netdesign.placement.evaluation import JointTables
 from netdesign.placement.optimal_design import information_of
 from netdesign.placement.preparation import joint_map_of, joint_tables
+from netdesign.placement.tables import JointTables
 from netdesign.placement.visibility_map import field_bounds
 
 KEPT = 20_000  # stations that are remembered

@@ -107,7 +107,6 @@ class Certificate:
         self.fixed = information_of(task, task.existing, seen).sum(axis=0)
         self.flat = self._sampled()
         self.space = StationCells(task)
-        self.cells = self.space.first()
 
     def proof(self, count: int) -> Proof | None:
         """Return what a good choice of Z proves for ``count`` images beside the existing ones; None: nothing."""
@@ -118,6 +117,7 @@ class Certificate:
             alone = (self.fixed[None], np.ones(1))
             return self._proof(*alone, np.inf) if (_traces(alone[0]) > 0.0).all() else None
         flat, weights = self.flat, np.full(len(self.flat), 1.0 / len(self.flat))
+        self.cells = self.space.first()  # cut for this choice alone: what another one needs would only cost time
         best: Proof | None = None
         stalled = 0
         for _ in range(ROUNDS):
@@ -241,12 +241,15 @@ def _axes(cells: Cells, found: Floats) -> Ints:
 
 
 def _some(counts: list[int]) -> list[int]:
-    """Of ascending numbers those that are a third larger than the one before, and the last."""
-    chosen: list[int] = []
-    for count in counts:
-        if not chosen or count >= 1.3 * chosen[-1] or count == counts[-1]:
-            chosen.append(count)
-    return chosen
+    """Of ascending numbers the largest, the one in the middle of the logarithms, and 0, where the bound is f1 itself.
+
+    A choice of the Z_j for one number of images is within half a per cent of the best for most others.
+    """
+    free = np.array([count for count in counts if count])
+    if not len(free):
+        return counts
+    middle = free[np.abs(np.log(free) - 0.5 * np.log(free[0] * free[-1])).argmin()]
+    return sorted({*(count for count in counts if count == 0), int(middle), int(free[-1])})
 
 
 def _gain_table(camera: Camera, outer: float) -> Floats:

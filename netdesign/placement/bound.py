@@ -107,6 +107,7 @@ class Certificate:
         self.fixed = information_of(task, task.existing, seen).sum(axis=0)
         self.flat = self._sampled()
         self.space = StationCells(task)
+        self.cells = self.space.first()
 
     def proof(self, count: int) -> Proof | None:
         """Return what a good choice of Z proves for ``count`` images beside the existing ones; None: nothing."""

@@ -30,7 +30,10 @@ COLOURS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Reach:
-    """Directions spread evenly over the admissible sphere, (k, 2) rad, and why each is refused ("free": it is not)."""
+    """Why stations are refused ("free": they are not).
+
+    viewpoints: (k, 2) rad, directions spread evenly over the admissible sphere; with a depth (k, 3), on shells in turn.
+    """
 
     viewpoints: Floats
     reasons: tuple[str, ...]
@@ -47,7 +50,7 @@ def reach_figure(record: RunRecord, mesh: PartMesh, reach: Reach) -> Figure | No
     if record.arm is None or joints is None:
         return None
     sphere, poses = record.task.sphere, network.world_from_cam
-    positions = sphere.centre + sphere.radius * sphere_directions(reach.viewpoints)
+    positions = sphere.centre + sphere.radii(reach.viewpoints)[:, None] * sphere_directions(reach.viewpoints)
     colours = np.array([COLOURS[reason] for reason in reach.reasons])
     with rc_context(STYLE):
         figure = Figure(figsize=(9.6, 5.2))

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from netdesign.errors import InputError
 from netdesign.files.store import read_json, write_json
 from netdesign.model.scene import Part
+from netdesign.model.stations import Depth
 from netdesign.motion.collision import REASONS
 from netdesign.motion.kinematics import forward
 from netdesign.motion.robot import load_chain
@@ -21,7 +22,7 @@ from netdesign.report import read_run, write_report
 from netdesign.reporting import arm, charts, drawing, mesh, palette, payload, reach, words
 from tests import cells
 from tests.runs import fail, pool_run, prove, ring_run
-from tests.scenes import CAMERA, box_part, ring
+from tests.scenes import CAMERA, box_part, ring, sphere
 
 FAILURE = "tag 14 was found in 2 images only"
 
@@ -232,6 +233,17 @@ def test_every_reason_of_the_map_has_a_colour_and_a_share():
     assert set(reach.COLOURS) == set(REASONS)
     found = reach.Reach(viewpoints=np.zeros((4, 2)), reasons=("out of reach", "free", "free", "free"))
     assert list(found.shares().items()) == [("free", 0.75), ("out of reach", 0.25)]
+
+
+def test_the_caption_of_the_reach_tells_what_its_dots_stand_for():
+    on_sphere = words.reach_caption(sphere())
+    assert "share of the sphere" in on_sphere
+    for high, told in ((0.7, True), (0.5, False)):
+        shell = replace(sphere(), depth=Depth(shape="ellipsoid", low=np.full(3, 0.5), high=np.full(3, high)))
+        caption = words.reach_caption(shell)
+        assert "sphere" not in caption
+        assert "share of the directions" in caption
+        assert ("nearest, middle and farthest" in caption) == told
 
 
 def test_a_gridded_box_is_closed_and_faces_outwards():

@@ -17,10 +17,6 @@ from netdesign.reporting.payload import as_script, payload
 from netdesign.reporting.record import RunRecord
 
 Values = dict[str, Any]
-REACH_CAPTION = (
-    "What the robot reaches, every dot the same share of the sphere, and the tour of the recommended network. Right: "
-    "the sphere from above, areas true. A direction is free where all four neighbours in the map are."
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +67,10 @@ def page(record: RunRecord, mesh: PartMesh, pictures: Pictures, study_text: str)
             "achieved": uri("webp", pictures.achieved) if pictures.achieved else "",
         },
         cell={"uri": uri("webp", pictures.cell) if pictures.cell else "", "caption": _cell_caption(record)},
-        reach={"uri": uri("webp", pictures.reach) if pictures.reach else "", "caption": REACH_CAPTION},
+        reach={
+            "uri": uri("webp", pictures.reach) if pictures.reach else "",
+            "caption": words.reach_caption(record.task.sphere),
+        },
         columns=_columns(record),
         rows=_rows(record),
         networks=[article(record, network, pictures.networks[network.id]) for network in record.networks],

@@ -4,6 +4,7 @@ from collections import Counter
 
 import numpy as np
 
+from netdesign.model.stations import ViewingSphere
 from netdesign.model.study import Study, ViewpointsTable
 from netdesign.reporting.record import UM, NetworkRecord, RunRecord
 
@@ -206,6 +207,20 @@ def stations(table: ViewpointsTable) -> str:
         inner = between if low != high else "shell with semi-axes of "
         return inner + "{:g}, {:g}, {:g} mm".format(*high)
     return f"sphere of {low[0]:g} mm radius" if low == high else f"distance of {low[0]:g} to {high[0]:g} mm"
+
+
+def reach_caption(sphere: ViewingSphere) -> str:
+    """Return what the picture of the reach shows."""
+    if sphere.depth is None:
+        dots, above, free = "of the sphere", "the sphere from above", "A direction is free where all four neighbours in"
+    else:
+        where = " at its nearest, middle and farthest distance in turn" if sphere.depth.has_width else ""
+        dots, above = f"of the directions{where}", "the directions from above"
+        free = "The search asks the robot at every station exactly; a dot is free where all four neighbours in"
+    return (
+        f"What the robot reaches, every dot the same share {dots}, and the tour of the recommended network. Right: "
+        f"{above}, areas true. {free} the map are."
+    )
 
 
 def requirements(study: Study) -> list[str]:

@@ -122,7 +122,7 @@ def improve_networks(
     now, then = np.zeros((slots + 1, 3)), np.zeros((slots + 1, 3))  # directions
     cells, new_cells = np.zeros(slots + 1, np.int64), np.zeros(slots + 1, np.int64)
     rows, block = np.zeros(slots + 1, np.int64), np.zeros(ROWS * LANES)
-    values, new_values = np.zeros(blocks), np.zeros(blocks)
+    values, new_values, touched = np.zeros(blocks), np.zeros(blocks), np.zeros(blocks, np.bool_)
     moments, changed = np.zeros(blocks * KEPT), np.zeros(blocks * KEPT)
     at_least = np.zeros((tables.min_rays, tables.sure.shape[1]), np.uint64)
     sure, weight, points, radius, count = tables.sure, tables.weight, tables.points, tables.radius, tables.point_count
@@ -178,6 +178,9 @@ def improve_networks(
                 coming = np.uint64(0) if kind == REMOVE else seen_tags(new_cell, index, sure)
                 going = np.uint64(0) if kind == ADD else seen_tags(cells[i], index, sure)
                 new_values[index] = values[index]
+                touched[index] = (coming | going) != np.uint64(0)
+                if not touched[index]:
+                    continue
                 write_points(index, points, block)
                 load_moments(index, moments, block)
                 if coming != np.uint64(0):
@@ -186,10 +189,9 @@ def improve_networks(
                 if going != np.uint64(0):
                     write_weights(index, going, rows[i], weight, block)
                     add_camera(block, now[i, 0], now[i, 1], now[i, 2], radius, -1.0)
-                if (coming | going) != np.uint64(0):  # where neither is seen nothing changes
-                    total, lost = block_variances(block, radius, count - index * LANES)
-                    new_values[index] = largest_variance(block) if worst else total
-                    weak += lost
+                total, lost = block_variances(block, radius, count - index * LANES)
+                new_values[index] = largest_variance(block) if worst else total
+                weak += lost
                 save_moments(index, block, changed)
             if weak > 0:
                 violation[b, c] = weak
@@ -218,10 +220,11 @@ def improve_networks(
             here[i, 0], here[i, 1], cells[i] = there[i, 0], there[i, 1], new_cells[i]
             now[i, 0], now[i, 1], now[i, 2] = then[i, 0], then[i, 1], then[i, 2]
             rows[i] = new_row
-            for s in range(len(moments)):
-                moments[s] = changed[s]
             for index in range(blocks):
-                values[index] = new_values[index]
+                if touched[index]:
+                    values[index] = new_values[index]
+                    load_moments(index, changed, block)
+                    save_moments(index, block, moments)
             write_chords(now, k, i, D)
             for x in range(k + 1):
                 t[x] = trial[x]

@@ -210,15 +210,17 @@ class Problem(NetworkProblem):
         genes, used = np.zeros((count, width, slots, 2)), np.zeros((count, width), np.int64)
         objectives, violation = np.zeros((count, width, 2)), np.zeros((count, width))
 
+        step = count if self.threads == 1 else 1  # a member takes long enough for a call of its own
+
         def part(start: int) -> None:
-            rows = slice(start, start + 1)
+            rows = slice(start, start + step)
             own = Tries(*(draw[rows] for draw in tries))  # type: ignore[arg-type]
             improve_networks(
                 viewpoints[rows], sizes[rows], own, self.tables,
                 genes[rows], used[rows], objectives[rows], violation[rows],
             )  # fmt: skip
 
-        self._share_out(part, range(count))
+        self._share_out(part, range(0, count, step))
         tried = used.ravel() > 0
         sizes = used.ravel()[tried]
         bits, genes = np.arange(slots) < sizes[:, None], genes.reshape(-1, slots, 2)[tried]

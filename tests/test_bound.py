@@ -146,8 +146,8 @@ class Recorded(Problem):
         self.__dict__.setdefault("seen", []).extend(row[chosen] for row, chosen in zip(genes, bits, strict=True))
         return super().evaluate(bits, genes)
 
-    def improve(self, rng, members):
-        tried = super().improve(rng, members)
+    def improve(self, rng, members, preference):
+        tried = super().improve(rng, members, preference)
         self.__dict__["seen"].extend(row[chosen] for row, chosen in zip(tried.genes, tried.bits, strict=True))
         return tried
 

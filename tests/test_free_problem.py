@@ -200,7 +200,8 @@ def test_existing_stations_on_the_sphere_take_the_fast_way():
     np.testing.assert_allclose(violation, broken)
     np.testing.assert_allclose(objectives[violation <= 0], expected[violation <= 0], rtol=1e-9)
     state = run(problem, "memetic", 30, 30, 1)
-    tried = problem.improve(rng, state.archive.members.take(np.arange(0, len(state.archive), 9)))
+    some = state.archive.members.take(np.arange(0, len(state.archive), 9))
+    tried = problem.improve(rng, some, rng.random(len(some)))
     again = problem.evaluate(tried.bits, tried.genes)
     good = tried.violation <= 0
     np.testing.assert_allclose(tried.objectives[good, 0], again[0][good, 0], rtol=1e-9)

@@ -167,7 +167,7 @@ class Dots:
 
     vary_structured = vary_plain
 
-    def improve(self, rng, members):
+    def improve(self, rng, members, preference):
         from netdesign.search.population import evaluated
 
         genes = np.clip(np.repeat(members.genes, 10, axis=0) + rng.normal(0, 0.02, (10 * len(members), 6, 1)), 0, 1)

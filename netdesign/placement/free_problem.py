@@ -131,12 +131,11 @@ class FreeProblem(NetworkProblem):
         count = len(self.task.scene.targets.ids)
         return np.array([station.sees for station in self.fixed], np.bool_).reshape(-1, count)
 
-    def improve(self, rng: np.random.Generator, members: Population) -> Population:
+    def improve(self, rng: np.random.Generator, members: Population, preference: Floats) -> Population:
         """Return evaluated neighbours of feasible members: rounds of moves, each from the best of the last one."""
         tried: list[tuple[Bools, Floats, Floats, Floats]] = []
         slots = self.chromosomes.slots
         here = [genes[bits] for genes, bits in zip(members.genes, members.bits, strict=True)]
-        preference = rng.random(len(members))
         value = _preferred(preference, members.objectives)
 
         def evaluated(networks: list[Floats]) -> tuple[Floats, Floats]:

@@ -45,7 +45,7 @@ class NetworkProblem(ABC):
         """Return objectives (P, 3) in SI units and violation (P,) of chromosomes."""
 
     @abstractmethod
-    def improve(self, rng: np.random.Generator, members: Population) -> Population:
+    def improve(self, rng: np.random.Generator, members: Population, preference: Floats) -> Population:
         """Return evaluated neighbours of feasible members, found by a local search from each of them."""
 
     @abstractmethod

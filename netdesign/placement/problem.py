@@ -187,7 +187,7 @@ class Problem(NetworkProblem):
             genes = np.concatenate([np.broadcast_to(self.pinned, (*count, 2)), genes], axis=1)
         return np.ascontiguousarray(bits), np.ascontiguousarray(genes)
 
-    def improve(self, rng: np.random.Generator, members: Population) -> Population:
+    def improve(self, rng: np.random.Generator, members: Population, preference: Floats) -> Population:
         """Return evaluated neighbours of feasible members, found by a local search from each of them."""
         fixed = len(self.pinned)
         slots, count, width = fixed + self.chromosomes.slots, len(members), MOVES + REMOVALS + ADDITIONS
@@ -204,7 +204,7 @@ class Problem(NetworkProblem):
             camera=rng.integers(0, 1 << 30, (count, width)),
             viewpoint=target,
             step=np.stack([bearing, length], axis=-1),
-            preference=rng.random(count),
+            preference=preference,
         )
         sizes = fixed + members.bits.sum(axis=1)
         genes, used = np.zeros((count, width, slots, 2)), np.zeros((count, width), np.int64)

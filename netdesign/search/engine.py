@@ -31,6 +31,8 @@ BREEDINGS = 20  # rounds of breeding that may replace copies
 SPARE = 4  # per cent of pairs that breed beyond need, in place of copies: cheaper than another round
 STRIDE = 10  # generations of breeding between two updates of the archive
 FEWEST_PICKS, MOST_PICKS = 8, 32  # members improved between two updates of the archive, a sixth of the population
+SPREAD = 0.2  # of the preferences about the place on the staircase
+MEMBERS_PER_PICK = 50  # more of them once the archive is long, for its update takes as long as it is
 
 OnStep = Callable[[State], None]
 
@@ -94,7 +96,7 @@ def steps(problem: SearchProblem, engine: Engine, state: State, population: int,
             survivors, ranks, crowding = survive(joined([state.population, children]), population)
             state = replace(state, population=survivors, ranks=ranks, crowding=crowding)
         else:
-            children = problem.improve(rng, _picks(rng, state, population))
+            children = problem.improve(rng, *_picks(rng, state, population))
         pending = (*state.pending, children)
         state = replace(state, step=state.step + 1, random=generator_state(rng), pending=pending)
         # Breeding does not look at the archive: it may wait.
@@ -145,14 +147,19 @@ def _factors(count: int) -> NDArray[np.uint64]:
     return np.random.default_rng(0).integers(0, 1 << 63, count, dtype=np.uint64) * 2 + 1
 
 
-def _picks(rng: np.random.Generator, state: State, population: int) -> Population:
-    """Members for the local search: a size at random, then one of its members, so that no size is neglected."""
-    count = min(MOST_PICKS, max(FEWEST_PICKS, population // 6))
+def _picks(rng: np.random.Generator, state: State, population: int) -> tuple[Population, Floats]:
+    """Members for the local search, and what each is improved for: a size at random, so that none is neglected.
+
+    Of a size one of its staircase: where that falls steeply, at the small first objectives, the first counts most.
+    """
+    count = max(min(MOST_PICKS, max(FEWEST_PICKS, population // 6)), len(state.archive) // MEMBERS_PER_PICK)
     sizes: Ints = state.archive.sizes
     different, starts, counts = np.unique(sizes, return_index=True, return_counts=True)
     layer = rng.integers(0, len(different), count)
-    rows = starts[layer] + np.floor(rng.random(count) * counts[layer]).astype(np.int64)
-    return state.archive.members.take(rows)
+    place = rng.random(count)
+    rows = starts[layer] + np.floor(place * counts[layer]).astype(np.int64)
+    preference = np.clip(1.0 - place + SPREAD * rng.uniform(-1.0, 1.0, count), 0.0, 1.0)
+    return state.archive.members.take(rows), preference
 
 
 def _noted(problem: SearchProblem, state: State) -> State:

@@ -84,8 +84,11 @@ class SearchProblem(Protocol):
     def vary_structured(self, rng: np.random.Generator, first: Population, second: Population) -> tuple[Bools, Floats]:
         """Return children by operators that know what a gene means."""
 
-    def improve(self, rng: np.random.Generator, members: Population) -> Population:
-        """Return evaluated neighbours of feasible members: every row counts as one evaluation."""
+    def improve(self, rng: np.random.Generator, members: Population, preference: Floats) -> Population:
+        """Return evaluated neighbours of feasible members: every row counts as one evaluation.
+
+        preference: (P,) in [0, 1], how much the first objective counts against the second.
+        """
 
     def normalise(self, objectives: Floats) -> Floats:
         """Return objectives (P, q) on scales where 0 is ideal and 1 the reference point of the hypervolume."""

@@ -151,7 +151,8 @@ class FreeProblem(NetworkProblem):
             owner = np.repeat(np.arange(len(here)), MOVES // ROUNDS)
             trials = [self._moved(rng, here[member]) for member in owner.tolist()]
             objectives, violation = evaluated(trials)
-            values = np.where(violation <= 0, _preferred(preference[owner], objectives), np.inf)
+            values, good = np.full(len(trials), np.inf), violation <= 0
+            values[good] = _preferred(preference[owner][good], objectives[good])
             for member in range(len(here)):
                 rows = np.flatnonzero(owner == member)
                 best = int(rows[np.argmin(values[rows])])

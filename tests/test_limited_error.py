@@ -12,7 +12,7 @@ from netdesign.photogrammetry.limited_error import (
     ROWS,
     VARIANCES,
     WEIGHT,
-    add_camera,
+    add_two_cameras,
     block_variances,
     blocked,
     direct_covariance,
@@ -31,7 +31,7 @@ def stations(count, seed, distance=0.6):
     return viewpoints, look_at(distance * sphere_directions(viewpoints), np.zeros(3), rng.uniform(-3, 3, count))
 
 
-ADD, FINISH = entry()(add_camera), entry()(block_variances)
+ADD, FINISH = entry()(add_two_cameras), entry()(block_variances)
 
 
 def moment_variances(viewpoints, points, visible, radius, focal, sigma):
@@ -42,9 +42,11 @@ def moment_variances(viewpoints, points, visible, radius, focal, sigma):
     for index in range(len(places)):
         block = np.zeros(ROWS * LANES)
         block[: 3 * LANES] = places[index]
-        for direction, weight in zip(sphere_directions(viewpoints), weights[index], strict=True):
-            block[WEIGHT * LANES : (WEIGHT + 1) * LANES] = weight
-            ADD(block, *direction, radius, 1.0)
+        directions = sphere_directions(viewpoints)
+        for first in range(0, len(directions), 2):
+            second = min(first + 1, len(directions) - 1)
+            block[WEIGHT * LANES : (WEIGHT + 2) * LANES] = weights[index][[first, second]].ravel()
+            ADD(block, *directions[first], *directions[second], radius, 1.0, float(second > first))
         total, lost = FINISH(block, radius, len(points) - index * LANES)
         weak += lost
         variances = block[VARIANCES * LANES : (VARIANCES + 3) * LANES]

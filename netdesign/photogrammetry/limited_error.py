@@ -138,38 +138,42 @@ def blocked(rows: Floats) -> Floats:
     return np.ascontiguousarray(padded.reshape(len(rows), count, LANES).transpose(1, 0, 2)).ravel()
 
 
-WEIGHT, MOMENTS, VARIANCES, SPARE, ROWS = 3, 4, 13, 16, 17
-"""Rows of a block at work: x, y, z; weights; xx, xy, xz, yy, yz, zz of S_uu and S_u; variances along x, y, z; spare.
+WEIGHT, MOMENTS, VARIANCES, SPARE, ROWS = 3, 5, 14, 17, 18
+"""Rows of a block at work: x, y, z; two rows of weights; xx, xy, xz, yy, yz, zz of S_uu and S_u; variances; spare.
 
 All in one array: where rows of several arrays meet, the compiler has to prove or test that they do not overlap.
 """
 
 
 @part(fastmath=FAST, allocates=False)
-def add_camera(block: Floats, ax: float, ay: float, az: float, radius: float, sign: float) -> None:
-    """Add a camera in the direction (ax, ay, az) of a sphere to the moments of a block of points.
+def add_two_cameras(
+    block: Floats, ax: float, ay: float, az: float, bx: float, by: float, bz: float, radius: float,
+    sign_a: float, sign_b: float,
+) -> None:  # fmt: skip
+    """Add two cameras, in the directions a and b of a sphere, to the moments of a block of points.
 
     Args:
         block: (ROWS * LANES,) changed in place. Its points are relative to the sphere's centre, m; its weights are 1 or
             1/sigma² where the camera sees the point, 0 where not.
-        radius: R in m.  sign: 1, or -1 to take the camera away.
+        radius: R in m.  sign_a, sign_b: 1, -1 to take the camera away, 0 to leave it out.
     """
     for lane in range(LANES):
         p = np.uint64(lane)  # unsigned: a signed index is tested for < 0, which keeps the loop scalar
         x, y, z = block[p], block[p + np.uint64(LANES)], block[p + np.uint64(2 * LANES)]
-        depth = radius - (ax * x + ay * y + az * z)
-        square = depth * depth
-        s = sign * block[p + np.uint64(WEIGHT * LANES)] / (square * square)
-        s_x, s_y, s_z = s * ax, s * ay, s * az
-        block[p + np.uint64(4 * LANES)] += s_x * ax
-        block[p + np.uint64(5 * LANES)] += s_x * ay
-        block[p + np.uint64(6 * LANES)] += s_x * az
-        block[p + np.uint64(7 * LANES)] += s_y * ay
-        block[p + np.uint64(8 * LANES)] += s_y * az
-        block[p + np.uint64(9 * LANES)] += s_z * az
-        block[p + np.uint64(10 * LANES)] += s_x
-        block[p + np.uint64(11 * LANES)] += s_y
-        block[p + np.uint64(12 * LANES)] += s_z
+        a, b = radius - (ax * x + ay * y + az * z), radius - (bx * x + by * y + bz * z)
+        a, b = a * a, b * b
+        a = sign_a * block[p + np.uint64(3 * LANES)] / (a * a)
+        b = sign_b * block[p + np.uint64(4 * LANES)] / (b * b)
+        a_x, a_y, a_z, b_x, b_y, b_z = a * ax, a * ay, a * az, b * bx, b * by, b * bz
+        block[p + np.uint64(5 * LANES)] += a_x * ax + b_x * bx
+        block[p + np.uint64(6 * LANES)] += a_x * ay + b_x * by
+        block[p + np.uint64(7 * LANES)] += a_x * az + b_x * bz
+        block[p + np.uint64(8 * LANES)] += a_y * ay + b_y * by
+        block[p + np.uint64(9 * LANES)] += a_y * az + b_y * bz
+        block[p + np.uint64(10 * LANES)] += a_z * az + b_z * bz
+        block[p + np.uint64(11 * LANES)] += a_x + b_x
+        block[p + np.uint64(12 * LANES)] += a_y + b_y
+        block[p + np.uint64(13 * LANES)] += a_z + b_z
 
 
 @part(fastmath=FAST, allocates=False)
@@ -177,7 +181,7 @@ def block_variances(block: Floats, radius: float, count: int) -> tuple[float, in
     """Write the variances of a block from its moments; return their sum and how many points are WEAK.
 
     Args:
-        block: (ROWS * LANES,) as in :func:`add_camera`; variances in units of 1 / f², m² when multiplied by
+        block: (ROWS * LANES,) as in :func:`add_two_cameras`; variances in units of 1 / f², m² when multiplied by
             sigma² / f² for unit weights.
         radius: R in m.
         count: points in the block; what pads it gets variance 0. Variances of WEAK points mean nothing.
@@ -188,19 +192,19 @@ def block_variances(block: Floats, radius: float, count: int) -> tuple[float, in
         p = np.uint64(lane)
         x, y, z = block[p], block[p + np.uint64(LANES)], block[p + np.uint64(2 * LANES)]
         sxx, sxy, sxz = (
-            block[p + np.uint64(4 * LANES)],
             block[p + np.uint64(5 * LANES)],
             block[p + np.uint64(6 * LANES)],
+            block[p + np.uint64(7 * LANES)],
         )
         syy, syz, szz = (
-            block[p + np.uint64(7 * LANES)],
             block[p + np.uint64(8 * LANES)],
             block[p + np.uint64(9 * LANES)],
+            block[p + np.uint64(10 * LANES)],
         )
         sx, sy, sz = (
-            block[p + np.uint64(10 * LANES)],
             block[p + np.uint64(11 * LANES)],
             block[p + np.uint64(12 * LANES)],
+            block[p + np.uint64(13 * LANES)],
         )
         total = sxx + syy + szz
         # |d|² summed over the cameras; N = spread I - A - B with A the d dᵀ part, B = [P]x S_uu [P]xᵀ.
@@ -220,8 +224,8 @@ def block_variances(block: Floats, radius: float, count: int) -> tuple[float, in
         real = lane < count
         weak += int(real & (determinant <= WEAK * trace * trace * trace))
         scale = 1.0 / determinant if real else 0.0
-        block[p + np.uint64(13 * LANES)] = cxx * scale if real else 0.0
-        block[p + np.uint64(14 * LANES)] = cyy * scale if real else 0.0
-        block[p + np.uint64(15 * LANES)] = czz * scale if real else 0.0
+        block[p + np.uint64(14 * LANES)] = cxx * scale if real else 0.0
+        block[p + np.uint64(15 * LANES)] = cyy * scale if real else 0.0
+        block[p + np.uint64(16 * LANES)] = czz * scale if real else 0.0
         trace_sum += (cxx + cyy + czz) * scale if real else 0.0
     return trace_sum, weak

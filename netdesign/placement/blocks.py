@@ -18,7 +18,7 @@ from netdesign.photogrammetry.limited_error import (
     SPARE,
     VARIANCES,
     WEIGHT,
-    add_camera,
+    add_two_cameras,
     block_variances,
 )
 from netdesign.placement.tables import MAX_SIGMA, SphereTables
@@ -71,17 +71,30 @@ def weight_row(alpha: float, beta: float, tables: SphereTables) -> int:
 
 
 @part(allocates=False)
-def write_weights(index: int, tags: np.uint64, row: int, weight: Floats, block: Floats) -> None:
-    """Write the weights of an image that sees ``tags`` of the block; ``row``: of ``weight``, unless it has only one."""
-    first, place = tags * np.uint64(LANES), np.uint64(WEIGHT * LANES)
+def write_seen(tags: np.uint64, slot: int, block: Floats) -> None:
+    """Write into ``slot`` (0, 1) weights of 1 for the points of ``tags``, 0 for the others."""
+    first, place = tags * np.uint64(LANES), np.uint64((WEIGHT + slot) * LANES)
     for lane in range(LANES):  # loops that only copy become block moves; others between two arrays stay scalar
         block[place + np.uint64(lane)] = FOUR_TAGS[first + np.uint64(lane)]
-    if len(weight) > 1:
-        start, spare = np.uint64(index * LANES), np.uint64(SPARE * LANES)
-        for lane in range(LANES):
-            block[spare + np.uint64(lane)] = weight[np.uint64(row), start + np.uint64(lane)]
-        for lane in range(LANES):
-            block[place + np.uint64(lane)] *= block[spare + np.uint64(lane)]
+
+
+@part(allocates=False)
+def weigh(index: int, row: int, slot: int, weight: Floats, block: Floats) -> None:
+    """Multiply the weights in ``slot`` by those of the block's points in ``row`` of ``weight``."""
+    start, spare, place = np.uint64(index * LANES), np.uint64(SPARE * LANES), np.uint64((WEIGHT + slot) * LANES)
+    for lane in range(LANES):
+        block[spare + np.uint64(lane)] = weight[np.uint64(row), start + np.uint64(lane)]
+    for lane in range(LANES):
+        block[place + np.uint64(lane)] *= block[spare + np.uint64(lane)]
+
+
+@part(allocates=False)
+def add_images(first: int, second: int, sign: float, directions: Floats, radius: float, block: Floats) -> None:
+    """Add the images whose weights are in slots 0 and 1, the second times ``sign``; ``directions`` (k, 3)."""
+    add_two_cameras(
+        block, directions[first, 0], directions[first, 1], directions[first, 2],
+        directions[second, 0], directions[second, 1], directions[second, 2], radius, 1.0, sign,
+    )  # fmt: skip
 
 
 @part(allocates=False)
@@ -124,14 +137,22 @@ def network_blocks(
         rows[i] = weight_row(viewpoints[i, 0], viewpoints[i, 1], tables)
     # Only what is needed goes into the inner calls: all of ``tables`` would be counted in and out every time.
     sure, weight, points, radius, count = tables.sure, tables.weight, tables.points, tables.radius, tables.point_count
-    worst = tables.criterion == MAX_SIGMA
+    worst, varies = tables.criterion == MAX_SIGMA, len(weight) > 1
     for index in range(len(values)):
         write_points(index, points, block)
+        waiting = -1  # two at a time
         for i in range(k):
             tags = seen_tags(cells[i], index, sure)
             if tags != np.uint64(0):
-                write_weights(index, tags, rows[i], weight, block)
-                add_camera(block, directions[i, 0], directions[i, 1], directions[i, 2], radius, 1.0)
+                slot = 0 if waiting < 0 else 1
+                write_seen(tags, slot, block)
+                if varies:
+                    weigh(index, rows[i], slot, weight, block)
+                if waiting >= 0:
+                    add_images(waiting, i, 1.0, directions, radius, block)
+                waiting = i if waiting < 0 else -1
+        if waiting >= 0:
+            add_images(waiting, waiting, 0.0, directions, radius, block)
         value, lost = block_variances(block, radius, count - index * LANES)
         values[index] = largest_variance(block) if worst else value
         weak += lost

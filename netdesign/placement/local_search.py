@@ -16,7 +16,7 @@ import numpy as np
 from netdesign.model.arrays import Floats, Ints
 from netdesign.model.compiled import entry, part
 from netdesign.motion.three_opt import improve
-from netdesign.photogrammetry.limited_error import LANES, ROWS, add_camera, block_variances
+from netdesign.photogrammetry.limited_error import LANES, ROWS, add_two_cameras, block_variances
 from netdesign.placement.blocks import (
     KEPT,
     largest_variance,
@@ -25,9 +25,10 @@ from netdesign.placement.blocks import (
     precision_objective,
     save_moments,
     seen_tags,
+    weigh,
     weight_row,
     write_points,
-    write_weights,
+    write_seen,
 )
 from netdesign.placement.evaluation import excess, missing_sightings, write_direction
 from netdesign.placement.tables import MAX_SIGMA, SphereTables
@@ -126,7 +127,7 @@ def improve_networks(
     moments, changed = np.zeros(blocks * KEPT), np.zeros(blocks * KEPT)
     at_least = np.zeros((tables.min_rays, tables.sure.shape[1]), np.uint64)
     sure, weight, points, radius, count = tables.sure, tables.weight, tables.points, tables.radius, tables.point_count
-    worst = tables.criterion == MAX_SIGMA
+    worst, varies = tables.criterion == MAX_SIGMA, len(tables.weight) > 1
     D, trial_D = np.zeros((slots + 2, slots + 2)), np.zeros((slots + 2, slots + 2))
     P = np.zeros((slots + 2, slots + 3))
     t, trial = np.zeros(slots + 2, np.int64), np.zeros(slots + 2, np.int64)
@@ -183,12 +184,14 @@ def improve_networks(
                     continue
                 write_points(index, points, block)
                 load_moments(index, moments, block)
-                if coming != np.uint64(0):
-                    write_weights(index, coming, new_row, weight, block)
-                    add_camera(block, then[i, 0], then[i, 1], then[i, 2], radius, 1.0)
-                if going != np.uint64(0):
-                    write_weights(index, going, rows[i], weight, block)
-                    add_camera(block, now[i, 0], now[i, 1], now[i, 2], radius, -1.0)
+                write_seen(coming, 0, block)
+                write_seen(going, 1, block)
+                if varies:
+                    weigh(index, new_row, 0, weight, block)
+                    weigh(index, rows[i] if kind != ADD else 0, 1, weight, block)
+                add_two_cameras(
+                    block, then[i, 0], then[i, 1], then[i, 2], now[i, 0], now[i, 1], now[i, 2], radius, 1.0, -1.0
+                )
                 total, lost = block_variances(block, radius, count - index * LANES)
                 new_values[index] = largest_variance(block) if worst else total
                 weak += lost

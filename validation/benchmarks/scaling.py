@@ -76,11 +76,12 @@ def _curve(of: str, sizes: list[int], case: Callable[[int], tuple[Problem, int]]
 def _evaluation(problem: Problem, population: int) -> float:
     """CPU seconds per network of evaluations of feasible networks with all images."""
     slots, cover = problem.chromosomes.slots, problem.cover.viewpoints
-    genes = problem.chromosomes.uniform(np.random.default_rng(0), (population, slots))
+    genes = problem.chromosomes.uniform(np.random.default_rng(0), (4 * population, slots))
     genes[:, : len(cover)] = cover
-    bits = np.ones((population, slots), np.bool_)
+    bits = np.ones(genes.shape[:2], np.bool_)
     _, violation = problem.evaluate(bits, genes)
-    if violation.any():
+    genes, bits = genes[violation <= 0][:population], bits[:population]  # the images of some do not hang together
+    if len(genes) < population:
         raise RuntimeError("expected feasible networks: they contain the cover")
     calls = max(1, 2000 // population)
     start = time.process_time()

@@ -221,6 +221,18 @@ def test_differences_equal_the_whole_evaluation(box):
     assert {-1, 0, 1} <= set((sizes[:, None] - members.bits.sum(axis=1)).ravel().tolist())
 
 
+def test_neighbours_are_sought_for_what_is_preferred(box):
+    """With all weight on one objective the best network tried is better in it than with all weight on the other."""
+    members = run(box, "memetic", 40, 20, 2).archive.members
+    some = members.take(np.arange(0, len(members), 5))
+    best = []
+    for weight in (1.0, 0.0):
+        tried = box.improve(np.random.default_rng(0), some, np.full(len(some), weight)).feasible.objectives
+        best.append(tried[:, :2].mean(axis=0))
+    assert best[0][0] < best[1][0]
+    assert best[1][1] < best[0][1]
+
+
 @pytest.mark.parametrize("objectives", [{"precision": "max_sigma"}, {"propagation": "total"}, {"propagation": "block"}])
 def test_other_criteria(objectives):
     problem = Problem.build(task_of(plate_scene(side=3), max_images=6, objectives=objectives))

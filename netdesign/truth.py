@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from netdesign.files.colmap import ColmapModel, point3d_id, write_model
+from netdesign.files.design_json import projection_record
 from netdesign.files.store import write_json, write_text
 from netdesign.imaging.photograph import Shoot
 from netdesign.model.arrays import Bools, Floats
@@ -102,11 +103,7 @@ def _fingerprint(drawn: Sequence[Scene]) -> str:
 def camera_record(camera: Camera) -> dict[str, Any]:
     """Return a camera with the keys of a study's [camera] table."""
     return {
-        "width_px": camera.width_px,
-        "height_px": camera.height_px,
-        "focal_px": camera.focal_px,
-        "principal_point_px": camera.principal_point_px,
-        "distortion": camera.distortion,
+        **projection_record(camera),
         "pixel_um": None if camera.pixel_m is None else camera.pixel_m / UM,
         "f_number": camera.f_number,
         "focus_mm": None if camera.focus_m is None else camera.focus_m / MM,

@@ -10,7 +10,7 @@ from pymoo.util.nds.non_dominated_sorting import NonDominatedSorting
 from netdesign.errors import InputError
 from netdesign.search.archive import non_dominated, staircases
 from netdesign.search.engine import hypervolume, offspring, run
-from netdesign.search.operators import polynomial_mutation, raised, root, sbx
+from netdesign.search.operators import flip_bits, polynomial_mutation, raised, root, sbx, uniform_crossover
 from netdesign.search.population import evaluated, joined
 from netdesign.search.selection import constrained_ranks, crowding, ranked, tournament
 from netdesign.search.state import load, save
@@ -57,6 +57,17 @@ def test_crowding_equals_pymoo_on_one_front(seed):
     np.testing.assert_allclose(ours[inner], 3 * theirs[inner], rtol=1e-9)
 
 
+@given(st.integers(0, 10**6), st.integers(1, 60))
+@settings(deadline=None, max_examples=30)
+def test_crowding_of_several_fronts_is_that_of_each_alone(seed, count):
+    rng = np.random.default_rng(seed)
+    objectives, ranks = rng.integers(0, 9, (count, 3)).astype(float), rng.integers(0, 4, count)
+    together = crowding(objectives, ranks)
+    for front in np.unique(ranks):
+        rows = ranks == front
+        np.testing.assert_allclose(together[rows], crowding(objectives[rows], np.zeros(rows.sum(), np.int64)))
+
+
 @given(st.integers(0, 10**6), st.integers(1, 120), st.sampled_from([0.0, 0.01, 0.2]))
 @settings(deadline=None, max_examples=60)
 def test_archives_are_strict_staircases_within_epsilon(seed, count, epsilon):
@@ -95,6 +106,18 @@ def test_operators_keep_bounds_and_means():
     mutants = polynomial_mutation(rng, first, lower, upper, 1.0, 20)
     assert ((mutants >= lower) & (mutants <= upper)).all()
     assert 0.02 < (np.abs(mutants - first) / (upper - lower)).mean() < 0.1
+
+
+def test_bits_cross_and_flip_as_often_as_they_should():
+    """Of n bits that differ a share p/2 changes sides; four standard deviations of pairs and bits are allowed."""
+    rng, pairs, n = np.random.default_rng(1), 4000, 30
+    first, second = np.zeros((pairs, n), bool), np.ones((pairs, n), bool)
+    children = uniform_crossover(rng, first, second, 0.9)
+    assert (children[:pairs] ^ children[pairs:]).all()  # each bit goes to one child
+    assert children[:pairs].mean() == pytest.approx(0.45, abs=4 * np.sqrt((0.09 / 4 + 0.25 / n) / pairs))
+    assert children[:pairs].any(axis=1).mean() == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / pairs))
+    flips = flip_bits(rng, first, 1 / 30).mean()
+    assert flips == pytest.approx(1 / 30, abs=4 * np.sqrt(1 / 30 / first.size))
 
 
 @given(st.integers(0, 10**6), st.integers(1, 15), st.integers(1, 6), st.integers(0, 30))

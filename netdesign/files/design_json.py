@@ -9,6 +9,7 @@ import numpy as np
 from netdesign.errors import InputError
 from netdesign.files.store import read_json, write_json
 from netdesign.model.arrays import Floats, frozen
+from netdesign.model.camera import Camera
 from netdesign.model.results import Design, DesignedNetwork, PointPrecision
 from netdesign.model.task import Task
 
@@ -151,14 +152,21 @@ def _rms_um(precision: PointPrecision) -> float:
     return float(np.sqrt(precision.mean_variance)) / UM
 
 
-def _camera(task: Task) -> dict[str, Any]:
-    camera = task.camera
+def projection_record(camera: Camera) -> dict[str, Any]:
+    """Return a camera's picture and projection with the keys of a study's [camera] table."""
     return {
         "width_px": camera.width_px,
         "height_px": camera.height_px,
         "focal_px": camera.focal_px,
         "principal_point_px": camera.principal_point_px,
         "distortion": camera.distortion,
+    }
+
+
+def _camera(task: Task) -> dict[str, Any]:
+    camera = task.camera
+    return {
+        **projection_record(camera),
         "sigma_px": camera.sigma_px,
         "corner_noise": None
         if camera.corner_noise is None

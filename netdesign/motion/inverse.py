@@ -45,14 +45,16 @@ def solve_closed(arm: ArmCell, targets: Floats) -> tuple[Floats, Bools]:
 
 
 @entry()
-def _closed(axes, points, wrist, flange_inverse, targets, solved, found):  # type: ignore[no-untyped-def]
+def _closed(
+    axes: Floats, points: Floats, wrist: Floats, flange_inverse: Floats, targets: Floats, solved: Floats, found: Bools
+) -> None:
     for node in range(targets.shape[0]):
         if targets[node, 3, 3] == 1.0:
             ur_branches(axes, points, wrist, flange_inverse, targets[node], solved[node], found[node])
 
 
 @entry()
-def _limited(lower, upper, joints, found, rest):  # type: ignore[no-untyped-def]
+def _limited(lower: Floats, upper: Floats, joints: Floats, found: Bools, rest: float) -> NDArray[np.int8]:
     """Bring joints (N, r) into their limits in place; return NO_SOLUTION, LIMITS or FREE (N,) int8.
 
     ``rest``: value of the last joint everywhere, NaN to leave it.

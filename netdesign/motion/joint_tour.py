@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netdesign.model.arrays import Floats
+from netdesign.model.arrays import Floats, Ints
 from netdesign.model.compiled import FAST, entry, part
 from netdesign.motion.cell import ArmCell
 from netdesign.motion.joint_lookup import LANES, MapArrays, options_of
@@ -228,13 +228,16 @@ def directions_tour(directions):  # type: ignore[no-untyped-def]
 
 
 @entry()
-def options_tour(options, count, directions, label, barred, law, timed, work):  # type: ignore[no-untyped-def]
+def options_tour(
+    options: Floats, count: Ints, directions: Floats, label: Ints, barred: Floats, law: Floats, timed: bool, work: Work
+) -> float:
     """Return the search's joint tour of n >= 1 stations whose options (n, r, K) are known, without dwell.
 
     It starts from the order that goes to the nearest of the unit directions (n, 3).
     """
     tour = directions_tour(directions)
-    return joint_tour(options, count, label, barred, law, timed, tour, np.int64(_ROUNDS), work)
+    length: float = joint_tour(options, count, label, barred, law, timed, tour, np.int64(_ROUNDS), work)
+    return length
 
 
 class SearchWork(NamedTuple):

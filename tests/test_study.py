@@ -83,6 +83,7 @@ def test_tags_lie_on_faces_and_do_not_overlap(study):
         ("size_mm = 20.0", "size_mm = 200.0\nspacing_mm=300\n#", r"no flat face of the part has room"),
         ("radius_mm = 600", "radius_mm = 100", r"radius_mm: expected more than the part's reach of 134\.6 mm"),
         ("radius_mm = 600", "radius_mm = 600\nelevation_deg = [50, 20]", r"elevation_deg: expected low < high"),
+        ("radius_mm = 600", "radius_mm = [700, 500]", r"radius_mm: expected low <= high, found \[700\.0, 500\.0\]"),
         ("format = 1", "format = 2", r"format: expected 1, found 2"),
         ("format = 1", "format = ", r"expected TOML"),
         ('name = "box"', "", r"name: expected a value, found none"),

@@ -109,7 +109,8 @@ class ViewpointsTable(Table):
             raise ValueError(f"expected exactly one of radius_mm, semi_axes_mm and box_mm, found {found}")
         low, high = self.extent_mm
         if any(one > other for one, other in zip(low, high, strict=True)) or (self.box_mm and low == high):
-            raise ValueError(f"{given[0]}: expected [low, high], found {list(low)} above {list(high)}")
+            found = str(getattr(self, given[0])).translate(str.maketrans("()", "[]"))
+            raise ValueError(f"{given[0]}: expected low <= high, found {found}")
         return self
 
     @property

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -174,7 +175,7 @@ def test_a_run_folder_holds_one_study(run, tmp_path):
     assert (run / "design.json").read_bytes() == before
 
 
-LONGER = STUDY.replace("population = 40\ngenerations = 10", "population = 100\ngenerations = 16000")
+LONGER = STUDY.replace("population = 40\ngenerations = 10", "population = 100\ngenerations = 40000")
 
 
 @pytest.mark.slow
@@ -186,19 +187,25 @@ def test_killed_ten_times_and_resumed_the_result_is_the_same(tmp_path):
     assert design(whole, LONGER, "--threads", "1").returncode == 0
     path, run = killed / "study.toml", killed / "run"
     path.write_text(LONGER)
-    rng, survived = np.random.default_rng(0), 0
-    for attempt in range(10):
+    rng, kills, resumed = np.random.default_rng(0), 0, 0
+    for attempt in range(60):
         command = [sys.executable, "-m", "netdesign", "design", str(path), "-o", str(run), "--resume"]
+        resumed += (run / "checkpoint.npz").is_file()
         process = subprocess.Popen([*command, "--threads", str(1 + attempt % 2)], stderr=subprocess.DEVNULL)
         until = time.monotonic() + 60
         while not (run / "study.toml").is_file() and time.monotonic() < until:
             time.sleep(0.05)
         time.sleep(rng.uniform(0.5, 5.0))
         process.kill()
-        process.wait()
-        survived += (run / "checkpoint.npz").is_file()
-        assert not (run / "design.json").is_file()  # killed before its end
-    assert survived >= 1
+        assert process.wait() in (0, -signal.SIGKILL)
+        kills += process.returncode == -signal.SIGKILL
+        if kills == 10:
+            break
+        if process.returncode == 0:  # a fast machine ends before it is killed: compare, and begin anew
+            assert (run / "design.json").read_bytes() == (whole / "run" / "design.json").read_bytes()
+            shutil.rmtree(run)
+    assert kills == 10
+    assert resumed >= 1
     result = design(killed, LONGER, "--resume", "--threads", "2")
     assert result.returncode == 0, result.stderr
     assert (run / "design.json").read_bytes() == (whole / "run" / "design.json").read_bytes()
@@ -207,7 +214,7 @@ def test_killed_ten_times_and_resumed_the_result_is_the_same(tmp_path):
 
 def test_a_termination_is_one_line_and_keeps_what_is_done(tmp_path):
     path, run = tmp_path / "study.toml", tmp_path / "run"
-    path.write_text(LONGER.replace("generations = 16000", "generations = 100000"))
+    path.write_text(LONGER.replace("generations = 40000", "generations = 100000"))
     command = [sys.executable, "-m", "netdesign", "design", str(path), "-o", str(run)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     until = time.monotonic() + 100

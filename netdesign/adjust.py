@@ -93,14 +93,8 @@ def adjust_folder(
             parameter_matrix(names, row)
     except ValueError as error:
         raise InputError(str(error)) from None
-    problem = BundleProblem(
-        observations=found.observations,
-        camera_of_image=found.camera_of_image,
-        intrinsics=found.intrinsics,
-        world_from_cam=found.world_from_cam,
-        points=found.points,
-        image_names=found.image_names,
-        point_names=found.point_names,
+    problem = replace(
+        found.problem(),
         refine=names,
         datum=datum or _usual_datum(control_path, poses_path, bars_path),
         datum_points=_mask(datum_points, found.point_names),

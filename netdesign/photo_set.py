@@ -13,7 +13,6 @@ import numpy as np
 
 from netdesign.adjustment.estimate import estimate
 from netdesign.adjustment.initial import TagSighting, poses_and_tags, poses_on_known_tags, square
-from netdesign.adjustment.problem import BundleProblem
 from netdesign.adjustment.solver import solve
 from netdesign.errors import InfeasibleError
 from netdesign.files.observations import ObservationSet
@@ -218,7 +217,7 @@ def _on_nominal(
     # One tag's pose is good to some ten millimetres; a robust resection on all of them to the nominal accuracy.
     count = len(targets.points)
     nominal = ControlPoints(point=np.arange(count), xyz=targets.points, sigma=np.zeros(count))
-    resection = replace(_problem(found), datum="fixed", control=nominal)
+    resection = replace(found.problem(), datum="fixed", control=nominal)
     return replace(found, world_from_cam=solve(resection, robust=True).problem.world_from_cam)
 
 
@@ -248,7 +247,7 @@ def _on_tags_alone(
     points = transform(world_from_tag[:, None], square(seen.size_m)[None]).reshape(-1, 3)
     found = _set(names, seen, camera, poses, points, _observations(measured, seen, sigma_px))
     tied, _ = _tied(found)
-    adjusted = estimate(replace(_problem(tied), refine=refine), robust=True)
+    adjusted = estimate(replace(tied.problem(), refine=refine), robust=True)
     points = np.where(adjusted.used[:, None], adjusted.points, points)
     poses[[names.index(name) for name in tied.image_names]] = adjusted.world_from_cam
     scale = seen.size_m / _mean_edge(points, adjusted.used)
@@ -260,15 +259,3 @@ def _mean_edge(points: Floats, used: Bools) -> float:
     """Return the mean edge of the tags whose four corners have an estimate."""
     corners = points.reshape(-1, CORNERS_PER_TAG, 3)[used.reshape(-1, CORNERS_PER_TAG).all(axis=1)]
     return float(np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).mean())
-
-
-def _problem(found: ObservationSet) -> BundleProblem:
-    return BundleProblem(
-        observations=found.observations,
-        camera_of_image=found.camera_of_image,
-        intrinsics=found.intrinsics,
-        world_from_cam=found.world_from_cam,
-        points=found.points,
-        image_names=found.image_names,
-        point_names=found.point_names,
-    )

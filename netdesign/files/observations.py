@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from netdesign.adjustment.problem import BundleProblem
 from netdesign.errors import InputError
 from netdesign.files.colmap import point3d_id, read_model
 from netdesign.files.csv_table import csv_rows, index_of, numbers
@@ -39,6 +40,18 @@ class ObservationSet:
     points: Floats
     observations: Observations
     sigma_known: bool
+
+    def problem(self) -> BundleProblem:
+        """Return the adjustment of the set in the usual datum, nothing refined, without control, bars or priors."""
+        return BundleProblem(
+            observations=self.observations,
+            camera_of_image=self.camera_of_image,
+            intrinsics=self.intrinsics,
+            world_from_cam=self.world_from_cam,
+            points=self.points,
+            image_names=self.image_names,
+            point_names=self.point_names,
+        )
 
     def without_blind_images(self) -> tuple["ObservationSet", tuple[str, ...]]:
         """Return the set without the images that have no image point (and their cameras), and their names."""

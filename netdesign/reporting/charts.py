@@ -37,25 +37,40 @@ def interval_chart(rows: Sequence[IntervalRow], level: str) -> Markup:
         return left + share * (width - left - right)
 
     bottom = top + step * len(rows)
-    parts = [
-        f'<line class="axis" x1="{at(tick):.1f}" x2="{at(tick):.1f}" y1="{top}" y2="{bottom}"/>'
-        f'<text class="tick" x="{at(tick):.1f}" y="{bottom + 14}" text-anchor="middle">{tick:g}</text>'
-        for tick in _ticks(low, high)
-    ]
+    parts = [_tick(tick, at(tick), top, bottom) for tick in _ticks(low, high)]
     for index, row in enumerate(rows):
         y = top + step * (index + 0.5)
         state = "good" if row.inside else "bad"
         parts.append(
-            f'<text class="label" x="0" y="{y + 1:.1f}">{escape(row.label)}</text>'
-            f'<text class="tick" x="0" y="{y + 13:.1f}">{escape(row.note)}</text>'
-            f'<rect class="range" x="{at(row.low):.1f}" y="{y - 6:.1f}" height="12" rx="3" '
+            _labels(row, y) + f'<rect class="range" x="{at(row.low):.1f}" y="{y - 6:.1f}" height="12" rx="3" '
             f'width="{max(at(row.high) - at(row.low), 1):.1f}"/>'
             f'<line class="expected" x1="{at(row.expected):.1f}" x2="{at(row.expected):.1f}" y1="{y - 9:.1f}" '
             f'y2="{y + 9:.1f}"/><circle class="{state}" cx="{at(row.value):.1f}" cy="{y:.1f}" r="5"/>'
-            f'<text class="value {state}" x="{width - right + 12}" y="{y + 4:.1f}">{row.value:.3f} '
-            f"{'✓' if row.inside else '✗'}</text>"
+            + _verdict(row, width - right + 12, y)
         )
     return svg(width, bottom + 20, parts, f"Statistics inside their {level} intervals")
+
+
+def _tick(value: float, x: float, top: float, bottom: float) -> str:
+    """Return an upright line of the axis with its number below."""
+    return (
+        f'<line class="axis" x1="{x:.1f}" x2="{x:.1f}" y1="{top}" y2="{bottom}"/>'
+        f'<text class="tick" x="{x:.1f}" y="{bottom + 14}" text-anchor="middle">{value:g}</text>'
+    )
+
+
+def _labels(row: "IntervalRow | BandRow", y: float) -> str:
+    """Return what stands left of a row: its name and, smaller, a note."""
+    return (
+        f'<text class="label" x="0" y="{y + 1:.1f}">{escape(row.label)}</text>'
+        f'<text class="tick" x="0" y="{y + 13:.1f}">{escape(row.note)}</text>'
+    )
+
+
+def _verdict(row: "IntervalRow | BandRow", x: float, y: float) -> str:
+    """Return what stands right of a row: its value, and whether it lies where it must."""
+    state, sign = ("good", "✓") if row.inside else ("bad", "✗")
+    return f'<text class="value {state}" x="{x}" y="{y + 4:.1f}">{row.value:.3f} {sign}</text>'
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,23 +102,16 @@ def band_chart(rows: Sequence[BandRow]) -> Markup:
         return left + (value - low) / (high - low) * (width - left - right)
 
     bottom = top + step * len(rows)
-    parts = [
-        f'<line class="axis" x1="{at(tick):.1f}" x2="{at(tick):.1f}" y1="{top}" y2="{bottom}"/>'
-        f'<text class="tick" x="{at(tick):.1f}" y="{bottom + 14}" text-anchor="middle">{tick:g}</text>'
-        for tick in _ticks(max(low, 1e-3), high)
-    ]
+    parts = [_tick(tick, at(tick), top, bottom) for tick in _ticks(max(low, 1e-3), high)]
     for index, row in enumerate(rows):
         y = top + step * (index + 0.5)
         state = "good" if row.inside else "bad"
         parts.append(
-            f'<text class="label" x="0" y="{y + 1:.1f}">{escape(row.label)}</text>'
-            f'<text class="tick" x="0" y="{y + 13:.1f}">{escape(row.note)}</text>'
-            f'<rect class="range" x="{at(row.margin[0]):.1f}" y="{y - 8:.1f}" height="16" rx="3" '
+            _labels(row, y) + f'<rect class="range" x="{at(row.margin[0]):.1f}" y="{y - 8:.1f}" height="16" rx="3" '
             f'width="{at(row.margin[1]) - at(row.margin[0]):.1f}"/>'
             f'<line class="whisker {state}" x1="{at(row.low):.1f}" x2="{at(row.high):.1f}" y1="{y:.1f}" y2="{y:.1f}"/>'
             f'<circle class="{state}" cx="{at(row.value):.1f}" cy="{y:.1f}" r="5"/>'
-            f'<text class="value {state}" x="{width - right + 12}" y="{y + 4:.1f}">{row.value:.3f} '
-            f"{'✓' if row.inside else '✗'}</text>"
+            + _verdict(row, width - right + 12, y)
         )
     return svg(width, bottom + 20, parts, "Estimates with 90 % intervals inside their margins")
 

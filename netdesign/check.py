@@ -92,6 +92,7 @@ def _record(
     near, far = task.camera.depth_of_field()
     return {
         "study": task.study.name,
+        "place": "sphere" if task.sphere.depth is None else "admissible stations",
         "study_sha256": task.sha256,
         "part": {"triangles": len(part.faces), "size_mm": np.ptp(part.vertices, axis=0) * 1e3},
         "tags": len(targets.ids),
@@ -102,6 +103,8 @@ def _record(
         "tag_mm": task.study.targets.size_mm,
         "fold_px": fold_radius_px(task.camera.intrinsics),
         "corner_px": image_radius_px(task.camera),
+        "noise": task.study.camera.noise,
+        "sigma_px": None if task.camera.corner_noise else task.camera.sigma_px,
         "depth_of_field_mm": [near * 1e3, far * 1e3],
         "sightings": seen.refusals,
         "seen_share": {str(tag): float(share) for tag, share in zip(seen.tag_ids, seen.share, strict=True)},
@@ -128,11 +131,16 @@ def _text(record: dict[str, Any]) -> str:
         names = ", ".join(str(tag) for tag in record["left_out"][:12])
         more = len(record["left_out"]) - 12
         lines.append(
-            f"  left out, seen from too little of the sphere (targets.min_seen_share): {len(record['left_out'])} tags, "
-            f"{names}{f' and {more} more' if more > 0 else ''}"
+            f"  left out, seen from too little of the {record['place']} (targets.min_seen_share):"
+            f" {len(record['left_out'])} tags, {names}{f' and {more} more' if more > 0 else ''}"
         )
     if record["gap_mm"]:
         lines.append(f"  {_standing_off(record['gap_mm'], record['tag_mm'])}")
+    lines.append(
+        "noise      the detector's model, which takes the place of sigma_px"
+        if record["sigma_px"] is None
+        else f"noise      {record['sigma_px']:g} px per image coordinate"
+    )
     near, far = record["depth_of_field_mm"]
     if np.isfinite(far) or near > 0:
         lines.append(f"sharp      {near:.0f} mm to {far:.0f} mm along the optical axis")
@@ -143,14 +151,14 @@ def _text(record: dict[str, Any]) -> str:
         )
     total = sum(record["sightings"].values())
     counts = "  ".join(f"{reason} {count}" for reason, count in record["sightings"].items() if count)
-    lines.append(f"sightings  {total} tested over the sphere: {counts}")
+    place = record["place"]
+    lines.append(f"sightings  {total} tested over the {place}: {counts}")
     shares = {tag: share for tag, share in record["seen_share"].items() if share < RARELY_SEEN}
     for tag, share in sorted(shares.items(), key=lambda item: item[1])[:10]:
         lines.append(
-            f"  tag {tag} is seen from {share:.1%} of the sphere, refused mostly by: {record['main_reason'][tag]}"
+            f"  tag {tag} is seen from {share:.1%} of the {place}, refused mostly by: {record['main_reason'][tag]}"
         )
-    place = "sphere" if record["proved"] else "stations"
-    lines.append(f"viewpoints {record['admissible_share']:.0%} of the {place} sees enough points for an image")
+    lines.append(f"viewpoints enough points for an image are seen from {record['admissible_share']:.0%} of the {place}")
     if record["least_images"]:
         lines.append(
             f"images     at least {record['least_images']} are needed"

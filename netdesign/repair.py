@@ -12,11 +12,11 @@ from netdesign.files.stations import parse_stations, stations_table
 from netdesign.files.store import write_text
 from netdesign.files.study import load_task
 from netdesign.model.arrays import Floats
-from netdesign.model.frames import viewpoints_of
 from netdesign.model.progress import Progress, silent
 from netdesign.placement.repair import Addition, Quality, Standing
 
 UM = 1e-6
+NAME = 35  # characters before the figures of a line
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,15 +63,17 @@ def repair_study(
         grown = np.concatenate([grown, found.world_from_cam[None]])
     progress("repair", add, max(add, 1))
     if output is not None:
-        write_text(output, stations_csv(viewpoints_of(-grown[:, :3, 2]), grown, None, ()))
+        write_text(output, stations_csv(task.sphere.placed(grown)[0], grown, None, ()))
     record = {
         "stations": len(poses),
         "min_rays": task.limits.min_rays,
+        "one_radius": task.sphere.depth is None,
         "now": _quality(now),
         "drop": [{"image": image, **_quality(quality)} for image, quality in enumerate(dropped)],
         "add": [
             {
                 "viewpoint_deg": np.degrees(item.viewpoint[:2]),
+                "radius_mm": 1e3 * float(np.linalg.norm(item.world_from_cam[:3, 3] - task.sphere.centre)),
                 "world_from_cam_mm": _mm(item.world_from_cam),
                 **_quality(item.quality),
             }
@@ -103,24 +105,27 @@ def _mm(pose: Floats) -> Floats:
 def _text(record: dict[str, Any], output: Path | None) -> str:
     """Return the tables that a person reads: the network, its images from the least to the most needed, additions."""
     now = record["now"]
-    head = f"{'':<26}{'rms sigma':>10}{'':>9}{'largest':>10}{'total rms':>11}{'rays':>6}"
+    head = f"{'':<{NAME}}{'rms sigma':>10}{'':>9}{'largest':>10}{'total rms':>11}{'rays':>6}"
     lines = [head, _line(f"now, {now['images']} images", now, None)]
     drops = sorted(record["drop"], key=lambda item: (item["points_below_min_rays"], item["f1_mm2"], item["image"]))
     lines += [_line(f"  without image {item['image'] + 1}", item, now) for item in drops]
     before = now
     for item in record["add"]:
         alpha, beta = item["viewpoint_deg"]
-        lines.append(_line(f"  with one at {alpha:.1f}, {beta:.1f}", item, before))
+        away = "" if record["one_radius"] else f", {item['radius_mm']:.0f} mm"
+        lines.append(_line(f"  with one at {alpha:.1f}, {beta:.1f}{away}", item, before))
         before = item
     below = now["points_below_min_rays"]
     if below:
         lines.append(f"{below} object points have fewer than {record['min_rays']} rays now")
     if now["images_below_min_points"]:
         lines.append(f"{now['images_below_min_points']} of the images see too few object points")
-    lines.append(
-        "sigmas in um; images counted from 1 in the order of the file; additions at azimuth, elevation in deg,"
-    )
-    lines.append("one after the other; the change is that of the rms sigma against the line it starts from")
+    distance = "" if record["one_radius"] else " and distance from centre_mm"
+    lines += [
+        "sigmas in um; images counted from 1 in the order of the file",
+        f"additions, one after the other, at azimuth, elevation in deg{distance}",
+        "the change is that of the rms sigma against the line it starts from",
+    ]
     if output is not None:
         lines.append(f"{output}: {now['images'] + len(record['add'])} stations")
     return "\n".join(lines)
@@ -134,7 +139,7 @@ def _line(name: str, quality: dict[str, Any], against: dict[str, Any] | None) ->
     rays = f"{quality['fewest_rays']}"
     note = f"  {quality['points_below_min_rays']} points below" if quality["points_below_min_rays"] else ""
     return (
-        f"{name:<26}{_sigma(quality['rms_sigma_um']):>10} {change:>8}{_sigma(quality['max_sigma_um']):>10}"
+        f"{name:<{NAME}}{_sigma(quality['rms_sigma_um']):>10} {change:>8}{_sigma(quality['max_sigma_um']):>10}"
         f"{'open' if total is None else _sigma(total):>11}{rays:>6}{note}"
     )
 

@@ -160,3 +160,24 @@ def test_the_command_says_what_it_did_and_writes_what_it_reads(tmp_path):
     assert "without image" in found.text
     with pytest.raises(InputError, match="--stations"):
         repair_study(tmp_path / "run/study.toml", None, 1)
+
+
+def test_an_added_station_of_a_shell_has_its_distance(tmp_path):
+    centre = [15.0, -10.0, 5.0]
+    viewpoints = {**STUDY["viewpoints"], "centre_mm": centre, "radius_mm": [500, 700], "azimuth_deg": [0, 360]}
+    write_inputs(tmp_path / "run", box_scene(spacing=0.06), {**STUDY, "viewpoints": viewpoints})
+    poses = crooked(5)
+    (tmp_path / "five.csv").write_text(stations_csv(viewpoints_of(poses[:, :3, 3]), poses, None, ()))
+    found = repair_study(tmp_path / "run/study.toml", str(tmp_path / "five.csv"), 1, tmp_path / "more.csv")
+    (added,) = found.record["add"]
+    offset = np.array(added["world_from_cam_mm"])[:3, 3] - centre
+    assert added["radius_mm"] == pytest.approx(np.linalg.norm(offset), rel=1e-9)
+    assert 500 - 1e-6 <= added["radius_mm"] <= 700 + 1e-6
+    assert f", {added['radius_mm']:.0f} mm " in found.text
+    # Alpha and beta are about the sphere's centre, also of stations that look elsewhere.
+    rows = np.genfromtxt(tmp_path / "more.csv", delimiter=",", names=True)
+    offsets = np.stack([rows["x_mm"], rows["y_mm"], rows["z_mm"]], axis=1) - centre
+    alpha, beta = np.radians(rows["alpha_deg"]), np.radians(rows["beta_deg"])
+    directions = np.stack([np.cos(beta) * np.cos(alpha), np.cos(beta) * np.sin(alpha), np.sin(beta)], axis=1)
+    np.testing.assert_allclose(offsets / np.linalg.norm(offsets, axis=1)[:, None], directions, atol=1e-9)
+    assert (rows["alpha_deg"] >= 0).all()

@@ -239,3 +239,17 @@ def test_check_says_where_the_lens_folds_the_image(study):
     found, focal = check_study(path), load_task(path).camera.focal_px.min()
     assert found.record["fold_px"] == pytest.approx(focal * 2 / 3 * np.sqrt(1 / 12), rel=1e-12)
     assert f"folds the image over {found.record['fold_px']:.0f} px" in found.text
+
+
+def test_check_says_which_noise_counts(study):
+    assert "noise      0.25 px per image coordinate" in check_study(study("[camera]", "[camera]\nsigma_px = 0.25")).text
+    both = check_study(study("[camera]", '[camera]\nsigma_px = 0.25\nnoise = "detector"'))
+    assert "noise      the detector's model, which takes the place of sigma_px" in both.text
+    assert both.record["sigma_px"] is None
+
+
+def test_check_says_of_stations_that_they_are_no_sphere(study):
+    assert "tested over the sphere" in check_study(study()).text
+    shells = check_study(study("radius_mm = 600", "radius_mm = [550, 650]")).text
+    assert "tested over the admissible stations" in shells
+    assert "sphere" not in shells

@@ -9,6 +9,7 @@ from netdesign.model.arrays import Bools, Floats, frozen
 from netdesign.model.frames import look_at, sphere_directions, viewpoints_of
 
 SHELLS = (0.0, 0.25, 0.5, 0.75, 1.0)
+ROUNDING = 1e-9  # rad, by which a direction read from a pose may be beside its range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,9 +125,20 @@ class ViewingSphere:
         return look_at(position, self.centre, (self.roll or 0.0) if roll is None else roll)
 
     def placed(self, world_from_cam: Floats) -> tuple[Floats, Floats]:
-        """Return (alpha, beta) rad (…, 2) and distance m (…) of stations (…, 4, 4) as seen from the centre."""
+        """Return (alpha, beta) rad (…, 2) and distance m (…) of stations (…, 4, 4) as seen from the centre.
+
+        Alpha is counted as the study counts it, within the range of azimuths, be it beyond ±pi; in (-pi, pi] for
+        stations outside of the range. Straight above or below, where it means nothing, it is the range's value
+        nearest 0.
+        """
         offset = world_from_cam[..., :3, 3] - self.centre
-        return viewpoints_of(offset), np.linalg.norm(offset, axis=-1)
+        viewpoints = viewpoints_of(offset)
+        alpha, (low, high) = viewpoints[..., 0], self.azimuth
+        counted = low + np.mod(alpha - low + ROUNDING, 2.0 * np.pi) - ROUNDING
+        inside = np.where(counted <= high + ROUNDING, np.clip(counted, low, high), alpha)
+        pole = np.hypot(offset[..., 0], offset[..., 1]) <= ROUNDING * np.abs(offset[..., 2])
+        viewpoints[..., 0] = np.where(pole, np.clip(0.0, low, high), inside)
+        return viewpoints, np.linalg.norm(offset, axis=-1)
 
     def sample(self, step: float) -> tuple[Floats, Floats]:
         """Return viewpoints (c, 2 or 3) in the middle of equal steps and their shares (c,) of the area.

@@ -61,8 +61,10 @@ class CameraTable(Table):
     f_number: Positive | None = None
     focus_mm: Positive | None = None
     dof_blur_px: Positive = Field(2.0, description="largest circle of confusion that counts as sharp")
-    sigma_px: Positive = Field(0.1, description="image-coordinate noise per coordinate")
-    noise: Literal["constant", "detector"] = Field("constant", description="detector: the fitted model of the detector")
+    sigma_px: Positive = Field(0.1, description="image-coordinate noise per coordinate, where noise is constant")
+    noise: Literal["constant", "detector"] = Field(
+        "constant", description="detector: the fitted model of the detector, which takes the place of sigma_px"
+    )
     noise_file: str | None = Field(None, description="written by calibrate-noise; default: the shipped calibration")
     blur_px: Positive = Field(0.7, description="Gaussian sigma of the optics")
     full_well_e: Positive = Field(1500, description="electrons at white")

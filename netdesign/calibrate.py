@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from netdesign.errors import InputError
-from netdesign.files.store import write_json
+from netdesign.files.store import demand_writable, write_json
 from netdesign.files.study import load_task
 from netdesign.imageset import each, worker_pool
 from netdesign.imaging.measure import measure
@@ -82,9 +82,11 @@ def calibrate_study(study: Path, output: Path, progress: Progress = silent, work
 
     Raises:
         InputError: the study is not one.
+        OSError: ``output`` cannot be written; said before anything is measured.
         EnvironmentProblem: rendering is not possible here.
     """
     task = load_task(study)
+    demand_writable(output)
     shoot = Shoot(seed=task.study.seed, supersample=task.study.validation.supersample)
     with worker_pool(workers) as executor:
         found = calibrate_noise(task.camera, shoot, executor=executor, progress=progress)

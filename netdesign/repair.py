@@ -9,7 +9,7 @@ import numpy as np
 from netdesign.errors import InfeasibleError, InputError
 from netdesign.files.robot_program import stations_csv
 from netdesign.files.stations import parse_stations, stations_table
-from netdesign.files.store import write_text
+from netdesign.files.store import demand_writable, write_text
 from netdesign.files.study import load_task
 from netdesign.model.arrays import Floats
 from netdesign.model.progress import Progress, silent
@@ -47,6 +47,8 @@ def repair_study(
         poses = task.existing
     else:
         raise InputError(f"{study}: expected --stations FILE, or viewpoints.existing in the study; found neither")
+    if output is not None:
+        demand_writable(output)
     standing = Standing(task)
     now, dropped = standing.quality(poses), standing.drops(poses)
     added: list[Addition] = []

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
-from netdesign.calibrate import calibrate_noise, write_calibration
+from netdesign.calibrate import calibrate_noise, calibrate_study, write_calibration
 from netdesign.files.noise import read_corner_noise
 from netdesign.imaging.photograph import Shoot
-from tests.scenes import CAMERA
+from tests.runs import STUDY, write_inputs
+from tests.scenes import CAMERA, box_scene
 
 
 def test_calibration_on_a_small_grid(tmp_path):
@@ -21,3 +22,13 @@ def test_calibration_on_a_small_grid(tmp_path):
     np.testing.assert_allclose(found.ratios, 1.0, atol=0.2)
     write_calibration(tmp_path / "noise.json", found, CAMERA, shoot)
     assert read_corner_noise(tmp_path / "noise.json") == found.noise
+
+
+def test_a_place_that_cannot_be_written_is_named_before_anything_is_measured(tmp_path, monkeypatch):
+    def measured(*_, **__):
+        raise AssertionError("measured")
+
+    write_inputs(tmp_path / "run", box_scene(spacing=0.06), STUDY)
+    monkeypatch.setattr("netdesign.calibrate.calibrate_noise", measured)
+    with pytest.raises(NotADirectoryError):
+        calibrate_study(tmp_path / "run/study.toml", tmp_path / "run/study.toml/noise.json", workers=1)

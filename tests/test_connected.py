@@ -11,9 +11,10 @@ from netdesign.errors import InfeasibleError
 from netdesign.model.scene import Targets
 from netdesign.photogrammetry.connectivity import loose_images
 from netdesign.placement import evaluation
-from netdesign.placement.finish import finish
+from netdesign.placement.finish import UNDETERMINED, Exact, finish
 from netdesign.placement.infeasible import why_infeasible
 from netdesign.placement.problem import Problem
+from netdesign.placement.ties import tying_stations
 from netdesign.search.engine import run, start
 from tests.scenes import box_scene, plate_scene, sphere
 from tests.test_placement import task_of
@@ -68,6 +69,53 @@ def test_a_part_in_two_halves_is_refused_with_the_reason():
     problem = Problem.build(task)
     with pytest.raises(InfeasibleError, match="share no object point with the others"):
         finish(problem, run(problem, "memetic", 20, 10, 1))
+
+
+@given(st.integers(2, 4), st.integers(0, 10**6))
+def test_two_images_tie_two_groups(groups, seed):
+    """Groups of three tags, of which connectors see one or two of two neighbours: a chain needs a pair for each gap."""
+    rng = np.random.default_rng(seed)
+    group = np.repeat(np.arange(groups), 3)
+    sees = np.repeat(group == np.arange(groups)[:, None], 2, axis=0)
+    left = np.repeat(np.arange(groups - 1), 5)
+    connectors = ((group == left[:, None]) | (group == left[:, None] + 1)) & (rng.random((len(left), 3 * groups)) < 0.5)
+    connectors[:, ::3] |= (group == left[:, None])[:, ::3] | (group == left[:, None] + 1)[:, ::3]
+    directions = rng.normal(size=(len(left), 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    found = tying_stations(sees, directions, connectors, 20)
+    assert len(np.unique(found)) == len(found) == 2 * (groups - 1)
+    assert sorted(left[found].tolist()) == sorted(2 * list(range(groups - 1)))
+    assert loose_images(np.concatenate([sees, connectors[found]])) == 0
+    assert len(tying_stations(sees, directions, connectors, 1)) == 0
+    assert len(tying_stations(sees, directions, np.zeros_like(connectors), 20)) == 0
+
+
+def test_faces_at_right_angles_are_tied_where_an_image_sees_barely_two(monkeypatch):
+    """A block with tags on its sides, seen at 50 degrees at most: a set cover looks at the faces one by one."""
+    task = task_of(box_scene(spacing=0.07), max_images=24, min_rays=3)
+    task = replace(
+        task,
+        limits=replace(task.limits, max_incidence=np.radians(50.0)),
+        sphere=sphere(max_images=24, elevation=(-30, 90)),
+    )
+    problem = Problem.build(task)
+    assert loose_images(problem.sees(problem.cover.viewpoints)) > 0
+    bits, genes = problem.seeds()
+    _, violation = problem.evaluate(bits, genes)
+    assert (violation <= 0).any()
+    state = run(problem, "memetic", 24, 3, 1)
+    design = finish(problem, state)
+    assert all(network.total is not None for network in design.networks)
+    # Where nothing of what the search kept is determined, what it began with may be.
+    exact, kept = Exact.network, len(state.archive.members)
+
+    def after_the_archive(self, viewpoints):
+        nonlocal kept
+        kept -= 1
+        return UNDETERMINED if kept >= 0 else exact(self, viewpoints)
+
+    monkeypatch.setattr(Exact, "network", after_the_archive)
+    assert finish(problem, state).networks
 
 
 def test_a_tag_that_no_candidate_sees_is_named_and_no_error(monkeypatch):

@@ -1,12 +1,13 @@
 """Files are whole or not there; the same value gives the same bytes."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from netdesign.errors import InputError
-from netdesign.files.store import plain, read_json, write_bytes, write_json
+from netdesign.files.store import demand_writable, plain, read_json, write_bytes, write_json
 
 
 def test_json_is_deterministic_and_strict(tmp_path):
@@ -41,3 +42,19 @@ def test_wrong_files(tmp_path, text, says):
     (tmp_path / "x.json").write_text(text)
     with pytest.raises(InputError, match=says):
         read_json(tmp_path / "x.json", "design")
+
+
+def test_what_cannot_be_written_is_known_beforehand(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    demand_writable(tmp_path / "file")
+    demand_writable(tmp_path / "new" / "deep" / "noise.json")
+    monkeypatch.chdir(tmp_path)
+    demand_writable(Path("noise.json"))
+    assert [item.name for item in tmp_path.iterdir()] == ["file"]
+    with pytest.raises(IsADirectoryError):
+        demand_writable(tmp_path)
+    with pytest.raises(NotADirectoryError):
+        demand_writable(tmp_path / "file" / "noise.json")
+    monkeypatch.setattr("os.access", lambda *_: False)
+    with pytest.raises(PermissionError, match="noise"):
+        demand_writable(tmp_path / "noise.json")

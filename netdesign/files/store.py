@@ -1,5 +1,6 @@
 """Writing without half-written files, and the envelope that every JSON file of ours carries."""
 
+import errno
 import json
 import math
 import os
@@ -23,6 +24,22 @@ def write_bytes(path: Path, data: bytes) -> None:
         raise OSError(error.errno, error.strerror, str(path)) from None
     finally:
         beside.unlink(missing_ok=True)
+
+
+def demand_writable(path: Path) -> None:
+    """Return when ``write_bytes`` can write ``path``, without writing: for what takes minutes to compute.
+
+    Raises:
+        OSError: ``path`` is a folder, lies below a file, or in a folder where nothing may be written.
+    """
+    above = next(folder for folder in (path.parent, *path.parent.parents) if folder.exists())
+    for trouble, found in (
+        (errno.EISDIR, path.is_dir()),
+        (errno.ENOTDIR, not above.is_dir()),
+        (errno.EACCES, not os.access(above, os.W_OK)),
+    ):
+        if found:
+            raise OSError(trouble, os.strerror(trouble), str(path))
 
 
 def write_text(path: Path, text: str) -> None:

@@ -3,23 +3,28 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 
 from netdesign.model.arrays import Bools, Floats
+from netdesign.model.frames import sphere_directions
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
+from netdesign.photogrammetry.connectivity import loose_images
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_trace import block_trace, total_trace
 from netdesign.placement.encoding import Chromosomes
 from netdesign.placement.optimal_design import information_of, rounded_networks
 from netdesign.placement.set_cover import Cover
+from netdesign.placement.ties import PER_TIE, tying_stations
 from netdesign.search.population import Population
 
 MOVES, REMOVALS, ADDITIONS = 40, 8, 4  # networks tried around one member in the local search
 TELEPORTS = 0.08  # share of the moves that go anywhere
+CONNECTORS = 6000  # stations among which images are sought that tie a network together
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,9 +113,12 @@ class NetworkProblem(ABC):
         return self.chromosomes.vary_structured(rng, first, second)
 
     def seeds(self) -> tuple[Bools, Floats]:
-        """Return the rounded optimal design of every size, the smallest cover, and larger networks that contain it."""
+        """Return the rounded optimal design of every size, the smallest cover, and larger networks that contain it.
+
+        What falls apart into images without a common tag gets the images that tie it together, while there is room.
+        """
         slots = self.chromosomes.slots
-        designed = self._designed()
+        designed = [self._tied(viewpoints) for viewpoints in self._designed()]
         genes = np.zeros((len(designed), slots, self.task.sphere.genes))
         for row, viewpoints in enumerate(designed):
             genes[row, : len(viewpoints)] = self.chromosomes.folded(viewpoints)
@@ -130,15 +138,35 @@ class NetworkProblem(ABC):
 
     def _cover_seeds(self) -> tuple[Bools, Floats]:
         """The smallest cover, and larger networks that contain it: deterministic."""
-        size, slots = len(self.cover.viewpoints), self.chromosomes.slots
+        smallest, slots = self._tied(self.cover.viewpoints), self.chromosomes.slots
+        size = len(smallest)
         if size == 0 or size > slots:
             return np.zeros((0, slots), np.bool_), np.zeros((0, slots, self.task.sphere.genes))
         rng = np.random.default_rng(0)
         count = 4 * (slots - size + 1)
         genes = self.chromosomes.uniform(rng, (count, slots))
-        genes[:, :size] = self.chromosomes.folded(self.cover.viewpoints)
+        genes[:, :size] = self.chromosomes.folded(smallest)
         bits = np.arange(slots) < (size + np.arange(count) % (slots - size + 1))[:, None]
         return bits, genes
+
+    def _tied(self, viewpoints: Floats) -> Floats:
+        """Return viewpoints (k, d), with those behind them that tie their images together if these fall apart."""
+        sees = np.concatenate([self.existing_sees, self.sees(viewpoints)])
+        room = self.chromosomes.slots - len(viewpoints)
+        if len(viewpoints) == 0 or room < PER_TIE or not loose_images(sees):
+            return viewpoints
+        stations, seen = self._connectors
+        directions = sphere_directions(stations[:, :2])
+        return np.concatenate([viewpoints, stations[tying_stations(sees, directions, seen, room)]])
+
+    @cached_property
+    def _connectors(self) -> tuple[Floats, Bools]:
+        """Stations (c, d) of a finer lattice than that of the set cover, within reach, and the tags (c, g) they see."""
+        stations = self.chromosomes.spread(CONNECTORS)
+        stations = stations[self.reachable(stations)]
+        sees = self.sees(stations)
+        enough = sees.sum(axis=1) >= self.min_tags
+        return stations[enough], sees[enough]
 
     def normalise(self, objectives: Floats) -> Floats:
         """Return objectives (P, 3) with 0 at the ideal and 1 at the reference: log f1, f2, f3."""

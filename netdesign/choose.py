@@ -9,6 +9,7 @@ import numpy as np
 from netdesign.errors import InfeasibleError, InputError
 from netdesign.files.store import plain, read_json
 from netdesign.model.arrays import Bools, Floats
+from netdesign.model.figures import significant
 from netdesign.model.task import Task
 from netdesign.photogrammetry.total_error import FLAG_RATIO
 from netdesign.placement import decide
@@ -151,7 +152,8 @@ def choose(
         reason += ": " + _trade(row, [other for other in rows if not asked or met[_index(networks, other.network)]])
     else:
         reason = f"{words} is the cheapest of {int(met.sum())} networks that meet: " + "; ".join(
-            f"{item['name']} {item['value']:.4g} of at most {item['limit']:g} {item['unit']}".rstrip() for item in asked
+            f"{item['name']} {significant(item['value'])} of at most {item['limit']:g} {item['unit']}".rstrip()
+            for item in asked
         )
     return Choice(
         network=row.network,
@@ -231,10 +233,12 @@ def _distances(design: dict[str, Any], task: Task) -> list[Requirement]:
 
 
 def _words(row: FrontRow) -> str:
-    total = "" if row.total_rms_sigma_um is None else f" ({row.total_rms_sigma_um:.1f} µm with total error propagation)"
+    total = ""
+    if row.total_rms_sigma_um is not None:
+        total = f" ({significant(row.total_rms_sigma_um, 3)} µm with total error propagation)"
     return (
-        f"network {row.network:04d} with {row.images} images, rms sigma {row.rms_sigma_um:.1f} µm{total} "
-        f"and a tour of {row.tour:.4g} {row.tour_unit}"
+        f"network {row.network:04d} with {row.images} images, rms sigma {significant(row.rms_sigma_um, 3)} µm{total} "
+        f"and a tour of {significant(row.tour)} {row.tour_unit}"
     )
 
 

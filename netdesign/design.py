@@ -12,6 +12,7 @@ import numba
 
 from netdesign.files.design_json import read_networks, read_unmet, write_design
 from netdesign.files.study import load_task, resolve
+from netdesign.model.figures import significant
 from netdesign.model.progress import Progress, silent
 from netdesign.model.results import Design
 from netdesign.model.task import Task
@@ -105,16 +106,17 @@ def _summary(task: Task, run: Path, design: Design, evaluations: int) -> str:
         sigma = [1e6 * network.precision.mean_variance**0.5 for network in layer]
         tour = [scale * network.f2 for network in layer]
         lines.append(
-            f"  {size:2d} images: 1 network, rms sigma {sigma[0]:.2f} um, tour {tour[0]:.4g} {unit}"
+            f"  {size:2d} images: 1 network, rms sigma {significant(sigma[0])} um, tour {significant(tour[0])} {unit}"
             if len(layer) == 1
-            else f"  {size:2d} images: {len(layer)} networks, rms sigma {min(sigma):.2f} to {max(sigma):.2f} um, "
-            f"tour {min(tour):.4g} to {max(tour):.4g} {unit}"
+            else f"  {size:2d} images: {len(layer)} networks, rms sigma {significant(min(sigma))} to"
+            f" {significant(max(sigma))} um, "
+            f"tour {significant(min(tour))} to {significant(max(tour))} {unit}"
         )
     lines += design.notes
     if design.answer is not None:
         network = design.networks[design.answer]
         lines.append(
             f"requirements: network {design.answer:04d} is the cheapest that meets them, {network.f3} images,"
-            f" tour {scale * network.f2:.4g} {unit}: {design.answer_reason}"
+            f" tour {significant(scale * network.f2)} {unit}: {design.answer_reason}"
         )
     return "\n".join(lines)

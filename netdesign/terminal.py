@@ -10,6 +10,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from netdesign.model.figures import significant
+
 SECONDS_BETWEEN_LINES = 5.0
 QUIET_SECONDS = 2.0  # a command that ends sooner needs no progress: bad input is one line and nothing else
 
@@ -83,4 +85,4 @@ def csv_table(rows: list[dict[str, Any]]) -> str:
 def _cell(value: Any) -> str:
     if value is None:
         return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return significant(value) if isinstance(value, float) else str(value)

@@ -128,3 +128,14 @@ def test_a_tag_that_no_candidate_sees_is_named_and_no_error(monkeypatch):
     state = start(problem, "memetic", 8, 1)
     assert why_infeasible(problem, state).startswith("1 of 9 tags are seen by fewer than 2 of ")
     assert "tags 4 (by 0)" in why_infeasible(problem, state)
+
+
+def test_images_without_a_point_are_named_where_none_is_asked_for():
+    task = task_of(plate_scene(side=2), max_images=4, min_rays=2)
+    limits = replace(task.limits, min_points_per_image=0)
+    problem = Problem.build(replace(task, limits=limits, sphere=sphere(max_images=4, elevation=(-90, 90))))
+    state = start(problem, "memetic", 8, 1)
+    from_below = np.full_like(state.population.genes, -1.5)
+    said = why_infeasible(problem, replace(state, population=replace(state.population, genes=from_below)))
+    assert "images see no object point" in said
+    assert "fewer than 0" not in said

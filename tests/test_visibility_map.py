@@ -6,8 +6,10 @@ import trimesh
 
 from netdesign.model.scene import Part, Scene
 from netdesign.photogrammetry.bvh import TriangleTree
+from netdesign.photogrammetry.collinearity import project
 from netdesign.photogrammetry.occlusion import cone_is_free, neighbours
-from netdesign.photogrammetry.visibility import sightings
+from netdesign.photogrammetry.visibility import sight_settings, sightings
+from netdesign.placement.visibility_cells import stretches
 from netdesign.placement.visibility_map import VisibilityMap, cell_index, field_bounds, spread_angle
 from tests.scenes import CAMERA, LIMITS, box_scene, plate_scene, sphere
 from tests.test_visibility import bracket_scene
@@ -16,6 +18,7 @@ WIDE = replace(
     CAMERA, focal_px=np.array([2600.0, 2500]), distortion=np.array([-0.2, 0.1, 1e-3, -2e-3]), pixel_m=3.45e-6,
     f_number=5.6, focus_m=0.6,
 )  # fmt: skip
+SHORT = replace(CAMERA, focal_px=np.array([1250.0, 1250.0]), distortion=np.array([-0.25, 0.07, 1e-3, -5e-4]))
 COARSE = np.radians(2)
 
 
@@ -49,6 +52,7 @@ CASES = {
     "torus": (torus_scene(), CAMERA, sphere(radius=0.59), LIMITS),
     "every limit binds": (bracket_scene(), WIDE, sphere(radius=0.5, roll=0.4), replace(LIMITS, min_tag_px=55)),
     "free roll": (bracket_scene(), WIDE, sphere(radius=0.4, roll=None), replace(LIMITS, min_tag_px=60)),
+    "short lens, free roll": (bracket_scene(), SHORT, sphere(radius=0.45, roll=None), LIMITS),
     "from below": (box_scene(spacing=0.1), WIDE, sphere(radius=0.35, elevation=(-89, 20)), LIMITS),
     "inside the part's reach": (plate_scene(), CAMERA, sphere(radius=0.16), LIMITS),
 }
@@ -75,6 +79,33 @@ def test_at_half_a_degree_little_is_undecided(name, most):
     undecided = grid_map.possible_tags(cells) & ~grid_map.sure_tags(cells)
     assert undecided.mean() < most
     assert grid_map.sure_tags(cells).mean() > 10 * undecided.mean()
+
+
+def test_a_short_lens_with_a_free_roll_sees_tags_for_certain():
+    """Its corners bend the image by more than its own size; what is measured with lies far inside of them."""
+    scene, camera, stations, limits = CASES["short lens, free roll"]
+    grid_map = VisibilityMap.build(scene, camera, stations, limits)
+    cells = np.arange(len(grid_map.sure))
+    undecided = grid_map.possible_tags(cells) & ~grid_map.sure_tags(cells)
+    assert grid_map.sure_tags(cells).mean() > 5 * undecided.mean()
+
+
+def test_the_stretch_of_a_distortion_bounds_its_edges():
+    rng = np.random.default_rng(5)
+    for _ in range(300):
+        camera = replace(CAMERA, distortion=rng.normal(size=4) * [0.3, 0.2, 5e-3, 5e-3], focal_px=np.ones(2))
+        settings, radius = (
+            sight_settings(replace(camera, principal_point_px=np.zeros(2)), LIMITS, 0.02),
+            rng.uniform(0, 1),
+        )
+        least, most = stretches(radius, settings)
+        ends = rng.normal(size=(60, 2, 2))
+        ends *= radius * rng.uniform(0, 1, (60, 2, 1)) / np.linalg.norm(ends, axis=2, keepdims=True)
+        flat = np.concatenate([ends, np.ones((60, 2, 1))], axis=2)
+        image = project(np.eye(4), flat, settings[:8])[0]
+        ratio = np.linalg.norm(image[:, 1] - image[:, 0], axis=1) / np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        assert (ratio >= least - 1e-9).all()
+        assert (ratio <= most + 1e-9).all()
 
 
 def test_a_finer_map_never_contradicts_a_coarser_one():

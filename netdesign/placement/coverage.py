@@ -83,7 +83,7 @@ class Coverage:
             )
         if self.lonely.any():
             lines.append(
-                f"visibility.min_points_per_image: {int(self.lonely.sum())} tags are seen only from viewpoints where "
+                f"visibility.min_points_per_image: {int(self.lonely.sum())} tag(s) are seen only from viewpoints where "
                 f"fewer than {self.min_points_per_image} object points are in view"
             )
         if not lines and self.least_images > self.max_images:

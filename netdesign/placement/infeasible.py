@@ -30,7 +30,9 @@ def why_infeasible(problem: NetworkProblem, state: State) -> str:
         parts.append(f"{4 * lacking.sum()} of {4 * len(lacking)} object points have fewer than {limits.min_rays} rays")
     poor = (sees.sum(axis=1) < problem.min_tags).sum()
     if poor:
-        parts.append(f"{poor} of {len(viewpoints)} images see fewer than {limits.min_points_per_image} points")
+        least = limits.min_points_per_image
+        what = f"fewer than {least} points" if least else "no object point"
+        parts.append(f"{poor} of {len(viewpoints)} images see {what}")
     loose = loose_images(np.concatenate([sees, problem.existing_sees]))
     if loose:
         parts.append(f"{loose} of {len(viewpoints)} images share no object point with the others{_groups(problem)}")

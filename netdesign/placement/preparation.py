@@ -128,9 +128,10 @@ def demanded_cover(
     needed = np.maximum(task.limits.min_rays - already, 0)
     if len(stations) == 0:
         reach = "within reach of the robot " if task.cell is not None and task.study.motion != "workspace" else ""
+        least = max(task.limits.min_points_per_image, CORNERS_PER_TAG)
         raise InfeasibleError(
-            f"no viewpoint {reach}sees {max(1, -(-task.limits.min_points_per_image // CORNERS_PER_TAG))} tags"
-            f" (min_points_per_image = {task.limits.min_points_per_image}); `netdesign check` counts the reasons"
+            f"no viewpoint {reach}sees {least} object points for certain (visibility.min_points_per_image ="
+            f" {task.limits.min_points_per_image}); `netdesign check` counts the reasons"
         )
     cover = smallest_cover(stations, sees, needed, slots)
     if needed.any() and not 0 < len(cover.viewpoints) <= slots:

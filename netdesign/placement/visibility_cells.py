@@ -34,6 +34,27 @@ Words = NDArray[np.uint64]
 Mesh = tuple[Floats, Ints, Floats, Ints, Ints, Ints]
 
 
+@part(allocates=False)
+def stretches(radius: float, settings: Floats) -> tuple[float, float]:
+    """Return the least and the largest stretch of a short or long edge by the distortion, within a normalised radius.
+
+    The distortion's Jacobian is symmetric with the eigenvalues 1 + 3 k1 s + 5 k2 s² along the radius and
+    1 + k1 s + k2 s² across, s = r², but for a tangential part of at most 6.4 (|p1| + |p2|) r. Integrated along an edge,
+    the least eigenvalue bounds the length of its image from below.
+    """
+    square = radius * radius
+    least = most = 1.0
+    for along in range(2):
+        linear, quadratic = settings[4] * (3.0 if along else 1.0), settings[5] * (5.0 if along else 1.0)
+        end = 1.0 + square * (linear + square * quadratic)
+        least, most = min(least, end), max(most, end)
+        if quadratic != 0.0 and 0.0 < -linear / (2.0 * quadratic) < square:
+            turn = 1.0 - linear * linear / (4.0 * quadratic)
+            least, most = min(least, turn), max(most, turn)
+    tangential = 6.4 * (abs(settings[6]) + abs(settings[7])) * radius
+    return max(least - tangential, 0.0), most + tangential
+
+
 @part()
 def classify(
     pose: Floats, radius: float, half_depth: float, delta: float, turn: float, points: Floats, away: Floats,
@@ -93,6 +114,7 @@ def classify(
     drift = turn * stretch * farthest_out / nearest + aside * approach
     shortest_low, shortest_high = np.inf, np.inf
     free_roll = field[2] > 0.0
+    least, most = stretches(aside, settings)
     margin = focal_high * (1.0 + bend) * shift + 1e-9
     u = v = first_u = first_v = last_u = last_v = 0.0
     for k in range(4):
@@ -106,8 +128,8 @@ def classify(
                 everywhere = False
             x0, y0 = image[k - 1, 0], image[k - 1, 1]
             length = math.sqrt((x - x0) ** 2 + (y - y0) ** 2)
-            shortest_low = min(shortest_low, focal_low * max(1.0 - bend, 0.0) * (length - edge_change))
-            shortest_high = min(shortest_high, focal_high * (1.0 + bend) * (length + edge_change))
+            shortest_low = min(shortest_low, focal_low * least * (length - edge_change))
+            shortest_high = min(shortest_high, focal_high * most * (length + edge_change))
             continue
         if s > settings[17]:
             return UNDECIDED

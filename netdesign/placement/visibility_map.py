@@ -25,7 +25,7 @@ from netdesign.photogrammetry.occlusion import LARGEST_PATCH, neighbours
 from netdesign.photogrammetry.visibility import monotone_radius_squared, shadowed, sight_points, sight_settings
 from netdesign.placement.visibility_cells import Words, fill
 
-VERSION = 1  # of the kernels: part of the key of the cache
+VERSION = 2  # of the kernels: part of the key of the cache
 COARSEST = 16  # cells along the edge of a block of the coarsest level
 
 

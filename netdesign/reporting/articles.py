@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from netdesign.model.figures import significant
 from netdesign.reporting import charts, proof, words
 from netdesign.reporting.record import UM, NetworkRecord, RunRecord, rms_um
 from netdesign.reporting.statics import exaggeration
@@ -27,7 +28,7 @@ def article(record: RunRecord, network: NetworkRecord, picture: bytes) -> Values
     ratio = network.bound_ratio
     numbers = [
         {"name": "images", "value": str(network.images)},
-        {"name": "tour", "value": f"{network.tour:.4g} {unit}"},
+        {"name": "tour", "value": f"{significant(network.tour)} {unit}"},
         {"name": "rms σ total", "value": f"{words.finite(network.total_rms_um)} µm"},
         {"name": "largest σ total", "value": f"{words.finite(network.total_max_um)} µm"},
         {"name": "rms σ limited", "value": f"{words.finite(network.rms_um)} µm"},

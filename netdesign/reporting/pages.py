@@ -10,6 +10,7 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from netdesign import __version__
+from netdesign.model.figures import significant
 from netdesign.reporting import charts, palette, proof, words
 from netdesign.reporting.articles import article, uri
 from netdesign.reporting.mesh import PartMesh
@@ -95,7 +96,7 @@ def _tiles(record: RunRecord) -> list[Values]:
             "name": "Recommended",
             "value": knee.name,
             "unit": "",
-            "note": f"{knee.images} images, tour {knee.tour:.4g} {record.tour_unit}",
+            "note": f"{knee.images} images, tour {significant(knee.tour)} {record.tour_unit}",
         },
         {
             "name": "Rms sigma, total",

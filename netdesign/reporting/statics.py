@@ -17,6 +17,7 @@ from PIL import Image
 
 from netdesign.errors import InputError
 from netdesign.model.arrays import Floats
+from netdesign.model.figures import significant
 from netdesign.photogrammetry.bvh import TriangleTree
 from netdesign.reporting import palette
 from netdesign.reporting.arm import box_mesh
@@ -143,7 +144,10 @@ def network_figure(record: RunRecord, network: NetworkRecord, mesh: PartMesh) ->
         left, right = figure.add_axes((0.01, 0.01, 0.48, 0.92)), figure.add_axes((0.51, 0.01, 0.48, 0.92))
         _stations(left, record, network, mesh)
         factor = _ellipsoids(right, record, network, mesh)
-        _title(left, f"Network {network.name}: {network.images} images, tour {network.tour:.4g} {record.tour_unit}")
+        _title(
+            left,
+            f"Network {network.name}: {network.images} images, tour {significant(network.tour)} {record.tour_unit}",
+        )
         _title(right, f"1-sigma ellipsoids × {factor:,.0f}".replace(",", " ") + ", total propagation")
     return figure
 

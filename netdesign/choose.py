@@ -142,7 +142,7 @@ def choose(
     index = _knee(design, met) if by_knee else decide.cheapest(objectives, met)
     rows = front_rows(run)
     row = next(row for row in rows if row.network == networks[index]["id"])
-    asked = tuple(
+    asked: tuple[dict[str, Any], ...] = tuple(
         {"name": item.name, "limit": item.limit, "value": float(item.values[index]), "unit": item.unit}
         for item in requirements
     )

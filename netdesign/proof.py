@@ -34,6 +34,7 @@ from netdesign.model.progress import Progress, silent
 from netdesign.model.results import PointPrecision
 from netdesign.model.scene import CORNERS_PER_TAG, Targets
 from netdesign.model.task import Task
+from netdesign.photogrammetry.intersection import convergence
 from netdesign.photogrammetry.limited_error import limited_covariance
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_error import total_covariance
@@ -42,6 +43,7 @@ from netdesign.truth import image_name
 
 # The detector's own limits; which tags are wanted is for the plan to say, up to 70 deg and a robot's error.
 GATES = Gates(max_incidence=float(np.radians(71.0)))
+ONE_PLACE = np.radians(0.3) ** 2 / 4.0  # convergence of two rays at 0.3 degrees
 OUTLIER_SIGNIFICANCE = 1e-4  # data snooping at 1e-3 would bias s0² by 0.7 %
 
 
@@ -88,7 +90,9 @@ def prove_network(
     paths = photograph(task, network, folder, repeat, executor)
     measured = measure_images(paths, task.camera, task.scene.targets, gates=GATES, executor=executor)
     observations, tag_covariances, unused = observations_of(_as_planned(task, network, measured), task.scene.targets)
-    observations, tag_covariances, alone = _intersected(observations, tag_covariances, task.scene.targets)
+    observations, tag_covariances, alone = _intersected(
+        observations, tag_covariances, task.scene.targets, network.world_from_cam
+    )
     write_text(folder / "observations.csv", observations_csv(observations, names, point_ids))
     record: dict[str, Any] = {
         "network": network.id,
@@ -227,12 +231,20 @@ def _as_planned(
 
 
 def _intersected(
-    observations: Observations, covariances: list[Floats], targets: Targets
+    observations: Observations, covariances: list[Floats], targets: Targets, planned: Floats
 ) -> tuple[Observations, list[Floats], list[str]]:
-    """Return the observations without tags that one image alone shows, and what those are: they have no position."""
+    """Return the observations without tags that one planned station alone shows, and what those are.
+
+    They have no position: the second picture of a station that a plan takes twice stands beside the first by what the
+    robot errs, which tells next to nothing.
+    """
     tag = observations.point[::CORNERS_PER_TAG] // CORNERS_PER_TAG
+    image = observations.image[::CORNERS_PER_TAG]
     images = np.bincount(tag, minlength=len(targets.ids))
-    kept = images[tag] > 1
+    ray = targets.centres[tag] - planned[image, :3, 3]
+    ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    one_place = (images > 1) & (convergence(ray, tag, len(targets.ids)) < ONE_PLACE)
+    kept = (images[tag] > 1) & ~one_place[tag]
     rows = np.repeat(kept, CORNERS_PER_TAG)
     left = Observations(
         image=observations.image[rows],
@@ -243,6 +255,10 @@ def _intersected(
     alone = [
         f"tag {targets.ids[index]}: measured in {images[index]} image(s), at least 2 needed"
         for index in np.flatnonzero(images < 2)
+    ]
+    alone += [
+        f"tag {targets.ids[index]}: measured in {images[index]} images of one station, at least 2 stations needed"
+        for index in np.flatnonzero(one_place)
     ]
     return left, [item for item, keep in zip(covariances, kept, strict=True) if keep], alone
 

@@ -203,3 +203,20 @@ def test_intrinsics_start_enters_only_as_a_start():
     sigma = np.sqrt(np.diag(a.parameter_covariance))
     assert (np.abs(a.intrinsics - b.intrinsics)[0, free] < 1e-6 * sigma).all()
     np.testing.assert_allclose(a.point_covariance, b.point_covariance, rtol=1e-6, atol=1e-16)
+
+
+@pytest.mark.parametrize("robust", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_points_that_two_photographs_from_one_station_alone_show_do_not_stop_the_others(seed, robust):
+    """A plan that takes a picture twice; the robot stands a millimetre off, and that alone tells where they are."""
+    plan, points = relief(4, 24, seed=seed, roll=False)
+    plan = np.concatenate([plan, plan[-1:]])
+    executed = disturbed(plan, points, seed=seed, position=0.001, rotation=0.005)[0]
+    visible = np.ones((5, 24), dtype=bool)
+    visible[:3, :4] = False  # four corners of a tag
+    observations = observe(executed, points, visible, sigma=0.006, seed=seed)
+    result = estimate(problem_of(observations, plan, points), robust=robust)
+    assert len(result.rejected) == 0
+    assert result.sigma0 == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * result.redundancy))
+    known = estimate(problem_of(observations, executed, points))
+    np.testing.assert_allclose(result.residuals_px, known.residuals_px, atol=1e-5)

@@ -85,19 +85,24 @@ def test_what_the_plan_does_not_count_on_is_not_used(proved):
 
 
 def test_a_tag_of_one_image_is_left_out_by_name(proved):
-    task, _ = proved
-    ids = task.scene.targets.ids
+    task, network = proved
+    ids, poses = task.scene.targets.ids, network.world_from_cam
     image, tag = np.array([0, 1, 0, 2]), np.array([0, 0, 1, 2])  # of tag 0 two images, of the others at most one
     point = (CORNERS_PER_TAG * tag[:, None] + np.arange(CORNERS_PER_TAG)).ravel()
     observations = Observations(
         image=np.repeat(image, CORNERS_PER_TAG), point=point, xy_px=np.zeros((16, 2)),
         covariance=np.tile(np.eye(2), (16, 1, 1)),
     )  # fmt: skip
-    left, covariances, alone = _intersected(observations, [k * np.eye(8) for k in range(4)], task.scene.targets)
+    each = [k * np.eye(8) for k in range(4)]
+    left, covariances, alone = _intersected(observations, each, task.scene.targets, poses)
     assert left.point.tolist() == [0, 1, 2, 3] * 2
     assert [matrix[0, 0] for matrix in covariances] == [0, 1]
     assert alone[0] == f"tag {ids[1]}: measured in 1 image(s), at least 2 needed"
     assert len(alone) == len(ids) - 1
+    twice = np.concatenate([poses[:1], poses[:1], poses[2:]])  # the plan takes the picture of one station twice
+    left, covariances, alone = _intersected(observations, each, task.scene.targets, twice)
+    assert len(left) == len(covariances) == 0
+    assert alone[-1] == f"tag {ids[0]}: measured in 2 images of one station, at least 2 stations needed"
 
 
 @pytest.mark.parametrize(("total", "says"), [(20.0, "0.01 px"), (1.0, "0.2 px"), (2.4, None), (None, None)])

@@ -5,6 +5,8 @@ Own Gauss-Newton rather than a general solver, because an adjustment is its cova
 what is not determined. GTSAM (``bundle``), Ceres and dense bordered normal equations confirm it in the tests.
 """
 
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 
 from netdesign.adjustment.appraisal import anchored, appraise, free_parameters
@@ -12,7 +14,7 @@ from netdesign.adjustment.diagnosis import calibration_complaints, coinciding_im
 from netdesign.adjustment.problem import BundleProblem, check_input, check_start, null_space
 from netdesign.adjustment.snooping import cleaned
 from netdesign.adjustment.solver import Iterations, Solution, equations, solve, unseen
-from netdesign.adjustment.start import in_datum_frame, with_better_points
+from netdesign.adjustment.start import in_datum_frame, with_better_points, without_faint_points
 from netdesign.errors import InfeasibleError
 from netdesign.model.adjustment import Adjustment, Rejection
 from netdesign.photogrammetry.connectivity import numeric_complaints
@@ -45,22 +47,50 @@ def estimate(
     check_input(problem)
     scaled, unit, centre = in_datum_frame(problem).normalised()
     check_start(scaled)
-    start = scaled.points
-    rejected: tuple[Rejection, ...] = ()
-    dropped: tuple[int, ...] = ()
-    before = 0
     exact = _open_at(scaled)[0] if scaled.refine else ()
     if exact:
         raise InfeasibleError("; ".join(exact + calibration_complaints(scaled, scaled.refine, None)))
-    try:
+
+    def attempt(begin: BundleProblem) -> tuple[Solution, tuple[Rejection, ...], tuple[int, ...], int]:
+        rejected: tuple[Rejection, ...] = ()
+        dropped: tuple[int, ...] = ()
+        before = 0
         if robust:
-            scaled, rejected, dropped, before = cleaned(with_better_points(scaled), significance, sigma_known)
-        solution = anchored(_solved(scaled, progress), start)
-    except InfeasibleError as error:
+            begin, rejected, dropped, before = cleaned(with_better_points(begin), significance, sigma_known)
+        return anchored(_solved(begin, progress), scaled.points), rejected, dropped, before
+
+    # Plain least squares rarely needs more than rough poses. A robust start does: where points with nearly parallel
+    # rays cannot get to their places, it settles with good image points given up.
+    starts: tuple[Callable[[], BundleProblem | None], ...] = (
+        lambda: scaled,
+        lambda: _with_known_poses(scaled, progress),
+    )
+    failure: InfeasibleError | None = None
+    for begin in reversed(starts) if robust else starts:
+        start = begin()
+        if start is None:
+            continue
+        try:
+            solution, rejected, dropped, before = attempt(start)
+            break
+        except InfeasibleError as error:
+            failure = failure or error
+    else:
         weak = _open_at(scaled)[1] or calibration_complaints(scaled, scaled.refine, None)
-        raise InfeasibleError("; ".join([str(error), *coinciding_images(scaled), *weak])) from None
+        raise InfeasibleError("; ".join([str(failure), *coinciding_images(scaled), *weak]))
     adjustment = appraise(solution, unit, centre, joint, rejected, dropped)
     return replace(adjustment, iterations=adjustment.iterations + before)
+
+
+def _with_known_poses(problem: BundleProblem, progress: Iterations) -> BundleProblem | None:
+    """Return the problem with poses adjusted without the points whose rays are nearly parallel; None if that fails."""
+    strong = without_faint_points(problem)
+    if strong is None or not len(strong.observations):
+        return None
+    with suppress(InfeasibleError):
+        found = solve(with_better_points(strong), robust=True, progress=progress).problem
+        return replace(found, observations=problem.observations)
+    return None
 
 
 def _solved(problem: BundleProblem, progress: Iterations) -> Solution:

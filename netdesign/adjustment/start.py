@@ -7,6 +7,8 @@ repairs, each taken only where it explains the image points better than what was
   known coordinates;
 * points: as given, or intersected from the poses.
 
+Where the adjustment fails all the same, points with nearly parallel rays wait until the poses are known.
+
 The frame of a free network is not touched: its datum stays on the coordinates that the user gave.
 """
 
@@ -18,9 +20,10 @@ from netdesign.adjustment.problem import BundleProblem
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.frames import similarity
 from netdesign.photogrammetry.collinearity import project
-from netdesign.photogrammetry.intersection import intersect, viewing_rays
+from netdesign.photogrammetry.intersection import convergence, intersect, viewing_rays
 
 MISFIT_PX = 10.0  # scale of the robust misfit: what is much farther off counts little more
+FAINT = np.radians(2.0) ** 2 / 4.0  # convergence of two rays at 2 degrees
 BEHIND = 50.0  # misfit of a point behind its camera: worse than any that lies in front
 
 
@@ -91,6 +94,20 @@ def with_better_points(problem: BundleProblem) -> BundleProblem:
     found, determined = _intersected(problem)
     better = determined & (_misfits(problem, found) < _misfits(problem, problem.points)) & ~problem.known()
     return replace(problem, points=np.where(better[:, None], found, problem.points))
+
+
+def without_faint_points(problem: BundleProblem) -> BundleProblem | None:
+    """Return the problem without the image points of points whose rays are nearly parallel; None if there are none.
+
+    Where such a point lies hangs on the base line between its stations, which rough poses do not even give the
+    direction of: on its way the point would have to cross infinity, and the iteration stops before it.
+    """
+    observations = problem.observations
+    intrinsics = problem.intrinsics[problem.camera_of_image[observations.image]]
+    rays = viewing_rays(problem.world_from_cam[observations.image], observations.xy_px, intrinsics)
+    faint = (convergence(rays, observations.point, len(problem.points)) < FAINT) & ~problem.known()
+    faint_rows = faint[observations.point]
+    return None if not faint_rows.any() else replace(problem, observations=observations.select(~faint_rows))
 
 
 def _intersected(problem: BundleProblem) -> tuple[Floats, Bools]:

@@ -26,6 +26,26 @@ def viewing_rays(world_from_cam: Floats, xy_px: Floats, intrinsics: Floats) -> F
     return np.asarray(np.einsum("kij,kj->ki", world_from_cam[:, :3, :3], direction))
 
 
+def convergence(direction: Floats, point: Ints, count: int) -> Floats:
+    """Return how far the rays of each point are from parallel, (count,), from 0 to 2/3.
+
+    The smallest eigenvalue of the mean of I - d dᵀ over unit directions (k, 3): a quarter of the squared angle between
+    two rays.
+    """
+    _, normal = _normals(direction, point, count)
+    return np.asarray(np.linalg.eigvalsh(normal)[:, 0] / np.maximum(np.bincount(point, minlength=count), 1))
+
+
+def _normals(direction: Floats, point: Ints, count: int) -> tuple[Floats, Floats]:
+    """Return I - d dᵀ of every ray (k, 3, 3) and their sums by point (count, 3, 3)."""
+    projector = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+    normal = np.zeros((count, 3, 3))
+    for i in range(3):
+        for j in range(3):
+            normal[:, i, j] = np.bincount(point, projector[:, i, j], count)
+    return projector, normal
+
+
 def intersect(origin: Floats, direction: Floats, point: Ints, count: int) -> tuple[Floats, Bools]:
     """Return the points (count, 3) with the least sum of squared distances to their rays, and which are determined.
 
@@ -34,13 +54,9 @@ def intersect(origin: Floats, direction: Floats, point: Ints, count: int) -> tup
 
     Points with fewer than two rays, or with parallel ones (within some 0.1 degrees), are not determined.
     """
-    projector = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+    projector, normal = _normals(direction, point, count)
     right = np.einsum("kij,kj->ki", projector, origin)
-    normal, rhs = np.zeros((count, 3, 3)), np.zeros((count, 3))
-    for i in range(3):
-        rhs[:, i] = np.bincount(point, right[:, i], count)
-        for j in range(3):
-            normal[:, i, j] = np.bincount(point, projector[:, i, j], count)
-    determined = np.linalg.eigvalsh(normal)[:, 0] > 1e-6 * np.maximum(np.bincount(point, minlength=count), 1)
+    rhs = np.stack([np.bincount(point, right[:, i], count) for i in range(3)], axis=1)
+    determined = convergence(direction, point, count) > 1e-6
     found = np.linalg.solve(np.where(determined[:, None, None], normal, np.eye(3)), rhs[:, :, None])[:, :, 0]
     return np.asarray(found, dtype=np.float64), determined

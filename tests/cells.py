@@ -5,9 +5,9 @@ import functools
 import numpy as np
 
 from netdesign.model.task import RobotCell
+from netdesign.motion.catalogue import find_robot, mount
 from netdesign.motion.cell import ArmCell, load_arm
 from netdesign.motion.joint_map import JointMap
-from netdesign.motion.robot import find_robot, mount
 from tests.scenes import box_part, sphere
 
 PART = box_part((0.24, 0.24, 0.20))

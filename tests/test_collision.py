@@ -1,14 +1,32 @@
 """Collision: capsules contain their meshes and miss nothing that the real meshes touch."""
 
+from dataclasses import replace
+
+import coal
 import numpy as np
+import pytest
 import trimesh
 
+from netdesign.errors import InputError
 from netdesign.motion.capsules import fit_capsules
-from netdesign.motion.collision import FREE, LIMITS, OBSTACLE, PART, SELF, SIGHT, part_field, states
+from netdesign.motion.cell import load_arm
+from netdesign.motion.collision import (
+    FREE,
+    LIMITS,
+    OBSTACLE,
+    PART,
+    SELF,
+    SIGHT,
+    SKIP,
+    TOUCH,
+    part_field,
+    states,
+)
 from netdesign.motion.kinematics import restarts
+from netdesign.motion.program import link_world_poses
 from tests.cells import PART as BOX
-from tests.cells import arm
-from tests.scenes import box_part
+from tests.cells import arm, cell
+from tests.scenes import box_part, sphere
 
 
 def distance_to_segment(points, start, end):
@@ -85,3 +103,65 @@ def test_pairs_that_are_tested_are_never_neighbours():
     assert (np.abs(links[here.meshes.pairs[:, 0]] - links[here.meshes.pairs[:, 1]]) > 1).all()
     assert len(here.meshes.pairs) > 5
     assert BOX is not None
+
+
+@pytest.mark.parametrize(("margin", "tower_x"), [(0.02, -0.72), (0.1, -0.75)])
+def test_a_tower_beside_the_base_is_an_obstacle_for_every_link(margin, tower_x):
+    """The base is within the margin of it, and shoulder and upper arm can turn away from it, so they keep theirs."""
+    low, high = np.array([tower_x - 0.04, -0.3, 0.0]), np.array([tower_x + 0.04, 0.3, 0.13])
+    table_and_pedestal = cell()
+    beside = replace(
+        table_and_pedestal,
+        margin=margin,
+        obstacle_centres=np.concatenate([table_and_pedestal.obstacle_centres, [0.5 * (low + high)]]),
+        obstacle_sizes=np.concatenate([table_and_pedestal.obstacle_sizes, [high - low]]),
+    )
+    loaded = load_arm(beside, sphere(), BOX)
+    q = restarts(loaded.placed, 300, seed=4)
+    free = states(loaded.body, q) == FREE
+    assert free.any()
+    box = coal.CollisionObject(coal.Box(*(high - low)), np.eye(3), 0.5 * (low + high))
+    shapes = [shape for shape in loaded.placed.shapes if shape.link in (1, 2)]
+    solids = [coal.CollisionObject(_bvh(shape)) for shape in shapes]
+    touched = 0
+    for row, joints in enumerate(q):
+        poses, gaps = link_world_poses(loaded, joints[None])[0], []
+        for shape, solid in zip(shapes, solids, strict=True):
+            solid.setTransform(coal.Transform3s(poses[shape.link - 1][:3, :3], poses[shape.link - 1][:3, 3]))
+            gaps.append(coal.distance(solid, box, coal.DistanceRequest(), coal.DistanceResult()))
+        kept = gaps[1] >= margin - 1e-6 and gaps[0] > 0.0  # the shoulder is nearer than 100 mm at every angle
+        touched += not kept
+        assert kept or not free[row]
+        assert kept or loaded.meshes.contact(joints)
+    assert touched > 20
+
+
+def _bvh(shape):
+    mesh = coal.BVHModelOBBRSS()
+    mesh.beginModel(len(shape.faces), len(shape.vertices))
+    mesh.addVertices(shape.vertices)
+    mesh.addTriangles(shape.faces)
+    mesh.endModel()
+    return mesh
+
+
+def test_what_the_base_stands_on_is_no_obstacle_for_the_links_above_it():
+    wide = replace(cell(), margin=0.1)
+    loaded = load_arm(wide, sphere(), BOX)
+    assert (loaded.meshes.mounting[1] == [SKIP, TOUCH]).all()  # the pedestal
+    assert (states(loaded.body, restarts(loaded.placed, 300, seed=5)) == FREE).any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"world_from_base": np.eye(4)}, r"robot\.base_position_mm: .* reaches into it"),
+        (
+            {"obstacle_centres": [[-0.6, 0, 0]], "obstacle_sizes": [[0.5, 0.5, 0.4]]},
+            r"robot\.obstacles: .*found obstacle 1 .* at every angle",
+        ),
+    ],
+)
+def test_a_base_that_stands_in_something_is_named(changes, message):
+    with pytest.raises(InputError, match=message):
+        load_arm(replace(cell(), **changes), sphere(), BOX)

@@ -1,12 +1,18 @@
 """The URDF becomes a chain: forward kinematics as pinocchio has it, clear errors, locked joints, renamed frames."""
 
+from pathlib import Path
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from netdesign.errors import InputError
+from netdesign.files.robot import bundle_robot, resolve_cell
+from netdesign.model.frames import pose, rotation_from_rpy
+from netdesign.model.study import RobotTable
+from netdesign.motion.catalogue import find_robot, mount
 from netdesign.motion.kinematics import base_from_flange, restarts
-from netdesign.motion.robot import find_robot, load_chain, mount
+from netdesign.motion.robot import load_chain
 from tests.cells import cell
 
 ROBOTS = ["ur3", "ur5", "ur10", "panda", "xarm7", "kinova", "z1"]
@@ -28,8 +34,8 @@ def test_forward_kinematics_equals_pinocchio(robot):
     chain = load_chain(cell(robot=robot))
     urdf, _, flange = find_robot(robot)
     joints = restarts(chain, 50, seed=1)
-    for q, pose in zip(joints, base_from_flange(chain, joints), strict=True):
-        np.testing.assert_allclose(pose, pinocchio_flange(urdf, flange, chain.joint_names, q), rtol=0, atol=1e-12)
+    for q, found in zip(joints, base_from_flange(chain, joints), strict=True):
+        np.testing.assert_allclose(found, pinocchio_flange(urdf, flange, chain.joint_names, q), rtol=0, atol=1e-12)
 
 
 def test_meshes_are_where_pinocchio_puts_them():
@@ -119,6 +125,43 @@ def test_errors_are_one_clear_line(tmp_path):
         load_chain(cell(limits={"elbow": (0.0, 1.0)}))
     with pytest.raises(InputError, match="camera_mount"):
         mount("top")
+    with pytest.raises(InputError, match=r"robot\.limits_rad\.elbow_joint: expected radians.*found \[-150, 150\]"):
+        load_chain(cell(limits={"elbow_joint": (-150.0, 150.0)}))
+    with pytest.raises(InputError, match=r"robot\.lock\.panda_joint4: expected -3\.\d+ to -0\.\d+ rad, found 90"):
+        load_chain(cell(robot="panda", lock={"panda_joint4": 90.0}))
+    with pytest.raises(InputError, match=r"robot\.tool_frame: expected the frame .* and \d+ more$") as long:
+        load_chain(cell(robot="anymal"))
+    assert len(str(long.value)) < 400
+
+
+def _mounted(matrix):
+    """(flange_from_cam m as used, flange_from_cam_mm as a run directory has it)."""
+    table = RobotTable(name="ur10", flange_from_cam_mm=tuple(map(tuple, matrix.tolist())))
+    return resolve_cell(table, Path()).flange_from_cam, np.array(bundle_robot(table, Path())[0].flange_from_cam_mm)
+
+
+@pytest.mark.parametrize("digits", [3, 4, 6])
+def test_a_camera_mount_with_few_digits_is_a_rotation_all_the_same(digits):
+    exact = pose(rotation_from_rpy(np.array([-1.26, 0.31, 2.2])), np.array([12.3, 40.0, 71.5]))
+    found, written = _mounted(np.round(exact, digits))
+    np.testing.assert_allclose((written * [1, 1, 1, 1e-3])[:3], found[:3], atol=1e-12)
+    assert np.abs(found[:3, :3] @ found[:3, :3].T - np.eye(3)).max() < 1e-15
+    assert np.abs(found[:3, :3] - exact[:3, :3]).max() < 2 * 10.0**-digits
+    np.testing.assert_allclose(found[:3, 3], exact[:3, 3] * 1e-3, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda m: m.T, r"last row \[0, 0, 0, 1\], found \[12\.\d*, .*transposed\?"),
+        (lambda m: m @ np.diag([1, 1, -1, 1]), "determinant -1"),
+        (lambda m: m * np.array([[1.01], [1], [1], [1]]), "singular values 1.01, 1, 1"),
+    ],
+)
+def test_what_is_no_camera_mount_is_said(wrong, message):
+    exact = pose(rotation_from_rpy(np.array([-1.5, 0.3, 0.0])), np.array([12.3, 40.0, 71.5]))
+    with pytest.raises(InputError, match=r"robot\.flange_from_cam_mm: .*" + message):
+        _mounted(wrong(exact))
 
 
 def _user_cell(urdf, tool_frame):

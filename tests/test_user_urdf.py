@@ -13,8 +13,9 @@ from netdesign.files.store import read_json
 from netdesign.files.study import load_task, resolve, write_resolved
 from netdesign.main_job import run_study
 from netdesign.model.progress import silent
+from netdesign.motion.catalogue import find_robot
 from netdesign.motion.kinematics import base_from_flange, restarts
-from netdesign.motion.robot import find_robot, load_chain
+from netdesign.motion.robot import load_chain
 from tests.test_datasets import DATASETS
 
 LINKS = [

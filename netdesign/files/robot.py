@@ -10,9 +10,11 @@ from netdesign.model.arrays import Floats
 from netdesign.model.frames import pose, rotation_from_rpy
 from netdesign.model.study import RobotTable
 from netdesign.model.task import RobotCell
+from netdesign.motion.catalogue import find_robot, mount
 from netdesign.motion.urdf import bundled_urdf
 
 MM = 1e-3
+_ROUNDED = 2e-3  # how far a rotation written with three digits may be from one
 
 
 def resolve_cell(table: RobotTable, folder: Path) -> RobotCell:
@@ -24,8 +26,6 @@ def resolve_cell(table: RobotTable, folder: Path) -> RobotCell:
     Raises:
         InputError: unknown robot name, missing URDF, or a flange_from_cam_mm that is not a rigid transform.
     """
-    from netdesign.motion.robot import find_robot, mount  # pinocchio is only loaded for studies with a robot
-
     if table.name is not None:
         name, (urdf, package_dirs, tool_frame) = table.name, find_robot(table.name)
     else:
@@ -62,9 +62,17 @@ def resolve_cell(table: RobotTable, folder: Path) -> RobotCell:
 def bundle_robot(table: RobotTable, folder: Path) -> tuple[RobotTable, dict[str, bytes]]:
     """Return the table with paths into inputs/robot, and the files to put there; a robot by name needs none.
 
+    A camera mount with few digits is written as the rotation that is used.
+
     Raises:
-        InputError: the URDF or a mesh that it names is missing.
+        InputError: the URDF or a mesh that it names is missing, or the camera mount is none.
     """
+    if table.flange_from_cam_mm is not None:
+        given = np.array(table.flange_from_cam_mm, dtype=np.float64)
+        used = _rigid(given)
+        used[:3, 3] = given[:3, 3]
+        if np.abs(used - given).max() > 1e-12:
+            table = table.model_copy(update={"flange_from_cam_mm": tuple(map(tuple, used.tolist()))})
     if table.urdf is None:
         return table, {}
     urdf = _urdf(table, folder)
@@ -77,18 +85,28 @@ def bundle_robot(table: RobotTable, folder: Path) -> tuple[RobotTable, dict[str,
 
 def _urdf(table: RobotTable, folder: Path) -> Path:
     urdf = resolve_path(str(table.urdf), folder)
+    if urdf.is_dir():
+        raise InputError(f"{urdf}: expected a URDF file, found a folder (robot.urdf)")
     if not urdf.is_file():
         raise InputError(f"{urdf}: no such file (robot.urdf)")
     return urdf
 
 
 def _rigid(matrix: Floats) -> Floats:
-    """Return a 4x4 transform in mm as metres after its rotation has been checked."""
-    rotation = matrix[:3, :3]
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > 1e-6 or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], [0, 0, 0, 1]):
+    """Return a 4x4 transform in mm as metres; a rotation given with few digits becomes the nearest one.
+
+    Raises:
+        InputError: the last row is another one, or the upper left 3x3 is no right-handed rotation.
+    """
+    key = "robot.flange_from_cam_mm"
+    if not np.allclose(matrix[3], [0, 0, 0, 1]):
+        hint = "; is the matrix transposed?" if np.allclose(matrix[:, 3], [0, 0, 0, 1]) else ""
+        raise InputError(f"{key}: expected a last row [0, 0, 0, 1], found {matrix[3].tolist()}{hint}")
+    left, stretch, right = np.linalg.svd(matrix[:3, :3])
+    handed = float(np.linalg.det(left @ right))
+    if np.abs(stretch - 1.0).max() > _ROUNDED or handed < 0:
         raise InputError(
-            f"robot.flange_from_cam_mm: expected a right-handed rotation and a last row 0 0 0 1, "
-            f"found R R^T off the identity by {error:.2g}, determinant {np.linalg.det(rotation):.3g}"
+            f"{key}: expected a right-handed rotation in the upper left 3x3, found singular values "
+            f"{', '.join(f'{value:.4g}' for value in stretch)} and determinant {np.linalg.det(matrix[:3, :3]):.3g}"
         )
-    return pose(rotation, matrix[:3, 3] * MM)
+    return pose(left @ right, matrix[:3, 3] * MM)

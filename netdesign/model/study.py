@@ -165,14 +165,19 @@ class RobotTable(Table):
     base_position_mm: Vector3 = (-600, 0, 0)
     base_rotation_deg: Vector3 = (0, 0, 0)
     camera_mount: Literal["side", "coaxial"] = "side"
-    flange_from_cam_mm: tuple[tuple[Number, ...], ...] | None = Field(None, description="4x4, instead of camera_mount")
+    flange_from_cam_mm: tuple[tuple[Number, ...], ...] | None = Field(
+        None, description="4x4, instead of camera_mount; three or more digits are made a rotation"
+    )
     lock: dict[str, Number] = Field(default_factory=dict, description="joint name = value in rad, not moved")
     limits_rad: dict[str, Range] = Field(default_factory=dict, description="joint name = [low, high], instead of URDF")
     joint_weights: tuple[NotNegative, ...] | None = Field(None, description="lambda of the source paper; default all 1")
     speed_rad_s: Positive = 1.05
     acceleration_rad_s2: Positive = 1.4
     dwell_s: NotNegative = 0.5
-    margin_mm: NotNegative = 20
+    margin_mm: NotNegative = Field(
+        20,
+        description="kept from part and obstacles; links 1 and 2: except from what the base stands on",
+    )
     obstacles: tuple[Obstacle, ...] = ()
     home_rad: tuple[Number, ...] | None = Field(
         None, description="joints where a program starts and ends; the ways there are checked, and are not in f2"

@@ -1,5 +1,6 @@
 """The robot cell ready for the kernels: chain, capsules, pairs to test, part and obstacles in one value."""
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from netdesign.model.scene import Part
 from netdesign.model.stations import ViewingSphere
 from netdesign.model.task import RobotCell
 from netdesign.motion.capsules import fit_capsules
-from netdesign.motion.collision import Body, overlapping, part_field
+from netdesign.motion.collision import SKIP, TOUCH, Body, near_box, overlapping, part_field
 from netdesign.motion.kinematics import restarts
 from netdesign.motion.mesh_collision import MeshCell, camera_capsules, learn_pairs, pairs_key
 from netdesign.motion.robot import Chain, load_chain
@@ -19,7 +20,7 @@ from netdesign.motion.stored import Arrays, content_key, stored
 from netdesign.motion.ur_kinematics import UrArm, ur_arm
 
 _SIGHT_BALLS = 8
-_VERSION = 3
+_VERSION = 4
 _SAMPLES = 300
 _NEARLY_ALWAYS = 0.8
 
@@ -63,7 +64,7 @@ def load_arm(cell: RobotCell, sphere: ViewingSphere, part: Part) -> ArmCell:
 
     Raises:
         InputError: see ``load_chain``; or joint_weights of another length than the arm has joints; or a home that is
-            not free.
+            not free; or a base inside the part or deep in an obstacle.
     """
     chain = load_chain(cell)
     if cell.joint_weights is not None and len(cell.joint_weights) != len(chain):
@@ -135,6 +136,7 @@ def _without_false_alarms(body: Body, meshes: MeshCell, placed: Chain) -> tuple[
     """Return the body without the capsule pairs that overlap in nearly every configuration that is free in truth.
 
     (The hub of a UR5's upper arm and its base, say: near by construction, and capsules are rounder than links.)
+    Likewise of links 1 and 2 and what the base stands on.
     """
 
     def build() -> Arrays:
@@ -144,7 +146,14 @@ def _without_false_alarms(body: Body, meshes: MeshCell, placed: Chain) -> tuple[
         return {"keep": overlapping(body, free) < _NEARLY_ALWAYS * len(free)}
 
     keep = stored(content_key("false alarms", _VERSION, body.capsules, body.pairs, body.placements), build)["keep"]
-    return body._replace(pairs=np.ascontiguousarray(body.pairs[keep])), not keep.all()
+    mounting, starts = body.mounting.copy(), restarts(placed, _SAMPLES, seed=2)
+    for box, link in itertools.product(meshes.beneath.tolist(), (1, 2)):
+        # Where the capsules are too near at every angle and the meshes are not, these have to say when they are.
+        for easier in (TOUCH, SKIP):
+            if near_box(body._replace(mounting=mounting), box, link, starts).all():
+                mounting[box, link - 1] = easier
+    loose = not keep.all() or bool((mounting != body.mounting).any())
+    return body._replace(pairs=np.ascontiguousarray(body.pairs[keep]), mounting=mounting), loose
 
 
 def _moved(capsules: Floats, target_from_source: Floats) -> Floats:

@@ -4,15 +4,18 @@ Self pairs are those that touch in some sampled configurations and not in nearly
 pair that never does in thousands of samples is left out of the capsule test too, where it may give false alarms.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import coal
 import numpy as np
 
+from netdesign.errors import InputError
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.frames import pose
 from netdesign.model.scene import Part
 from netdesign.model.task import RobotCell
+from netdesign.motion.collision import KEEP, SKIP, TOUCH
 from netdesign.motion.kinematics import link_poses, restarts
 from netdesign.motion.robot import Chain
 from netdesign.motion.stored import Arrays, content_key, stored
@@ -20,6 +23,8 @@ from netdesign.motion.stored import Arrays, content_key, stored
 _SAMPLES = 3000
 _NEARLY_ALWAYS = 0.95
 _BRACKET_RADIUS = 0.02
+_ANGLES = (181, 31)  # of the first two joints, over which it is found out what the base stands on
+PART = "the part"
 
 
 def camera_capsules(cell: RobotCell) -> Floats:
@@ -48,6 +53,9 @@ class MeshCell:
         part: None without one.
         boxes: (b, 6) centre and half edges in the world.
         margin: m kept from part and boxes.
+
+    Raises:
+        InputError: the base stands in the part, or so deep in a box that the first joint cannot turn.
     """
 
     def __init__(self, chain: Chain, camera: Floats, part: Part | None, boxes: Floats, margin: float) -> None:
@@ -58,7 +66,7 @@ class MeshCell:
             for shape in chain.shapes
         ]
         self._solids += [_capsule("camera", len(chain), capsule) for capsule in camera]
-        self._around = [] if part is None else [("the part", coal.CollisionObject(_mesh(part.vertices, part.faces)))]
+        self._around = [] if part is None else [(PART, coal.CollisionObject(_mesh(part.vertices, part.faces)))]
         for index, box in enumerate(boxes):
             item = coal.CollisionObject(coal.Box(*(2.0 * box[3:])))
             item.setTranslation(box[:3])
@@ -66,18 +74,10 @@ class MeshCell:
         for _, item in self._around:
             item.computeAABB()
         self.pairs: Ints = np.zeros((0, 2), dtype=np.int64)
-        self._mounting: frozenset[str] = frozenset()
         self._touch = coal.CollisionRequest(coal.CollisionRequestFlag.NO_REQUEST, 1)
         self._near = coal.CollisionRequest(coal.CollisionRequestFlag.NO_REQUEST, 1)
         self._near.security_margin = margin
-        self.place(np.zeros(len(chain)))
-        # What the base stands on is as near to the first moving link as a neighbouring link is.
-        self._mounting = frozenset(
-            name
-            for name, item in self._around
-            for solid in self._solids
-            if solid.link == 0 and coal.collide(solid.item, item, self._near, coal.CollisionResult())
-        )
+        self._mounting = self._stood_on(chain, part)
 
     def place(self, q: Floats) -> None:
         """Move every solid to joints q (r,)."""
@@ -89,6 +89,52 @@ class MeshCell:
                 base_from_solid = link[:, :3] @ base_from_solid
                 base_from_solid[:, 3] += link[:, 3]
             solid.item.setTransform(coal.Transform3s(base_from_solid[:, :3], base_from_solid[:, 3]))
+
+    def _stood_on(self, chain: Chain, part: Part | None) -> dict[str, tuple[int, int]]:
+        """Return how links 1 and 2 are tested against what the base stands on: KEEP, TOUCH or SKIP, see ``Body``.
+
+        The base is within the margin of it, and a link that comes no farther away at any angle of its joints cannot
+        keep the margin; a thing from which it can turn away is an obstacle like any other.
+        """
+        q = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
+        self.place(q)
+        beneath = [around for around in self._around if self._hits(0, around[1], self._near)]
+        if part is not None and (
+            self._hits(0, self._around[0][1], self._touch)
+            or any(_encloses(part, shape.vertices[0]) for shape in chain.shapes if shape.link == 0)
+        ):
+            raise InputError(
+                "robot.base_position_mm: expected a base outside of the part, found one that reaches into it"
+            )
+        last = np.minimum(chain.upper[:2], chain.lower[:2] + 2.0 * np.pi)
+        first, second = (np.linspace(chain.lower[joint], last[joint], _ANGLES[joint]) for joint in (0, 1))
+        ways: dict[str, tuple[int, int]] = {}
+        for name, item in beneath:
+            near, touching, far = [], [], False
+            for q[0] in first:
+                self.place(q)
+                near.append(self._hits(1, item, self._near))
+                touching.append(self._hits(1, item, self._touch))
+            if all(touching):
+                raise InputError(
+                    f"robot.obstacles: expected room for the first joint to turn, found {name} (counted from 1) around"
+                    " the base, so high that the first moving link touches it at every angle"
+                )
+            for q[0], q[1] in itertools.product(first[::6], second):
+                self.place(q)
+                far = not self._hits(2, item, self._near)
+                if far:
+                    break
+            ways[name] = (KEEP if not all(near) else TOUCH if any(touching) else SKIP, KEEP if far else TOUCH)
+        return ways
+
+    def _hits(self, link: int, item: coal.CollisionObject, request: coal.CollisionRequest) -> bool:
+        """Return whether a solid of a link touches or comes near an object."""
+        return any(
+            coal.collide(solid.item, item, request, coal.CollisionResult())
+            for solid in self._solids
+            if solid.link == link
+        )
 
     def touching(self, first: int, second: int) -> bool:
         """Return whether two solids of the arm touch where they stand now."""
@@ -102,10 +148,9 @@ class MeshCell:
             if solid.link == 0:
                 continue
             for name, item in self._around:
-                if solid.link == 1 and name in self._mounting:
-                    continue
-                # Links 1 and 2 are by construction near what the base stands on.
-                request = self._touch if solid.link == 2 and name in self._mounting else self._near
+                request = self._near
+                if solid.link <= 2 and name in self._mounting and self._mounting[name][solid.link - 1] != KEEP:
+                    request = self._touch
                 if coal.collide(solid.item, item, request, coal.CollisionResult()):
                     return f"{solid.name} touches {name}"
         for first, second in self.pairs.tolist():
@@ -128,10 +173,16 @@ class MeshCell:
         return any(self.touching(first, second) for first, second in self.pairs.tolist())
 
     @property
-    def mounting(self) -> Bools:
-        """(b,) whether the base stands on that obstacle: link 1 is not tested against it."""
-        names = [name for name, _ in self._around if name.startswith("obstacle")]
-        return np.array([name in self._mounting for name in names], dtype=np.bool_)
+    def mounting(self) -> Ints:
+        """(b, 2) how links 1 and 2 are tested against every obstacle, see ``Body``."""
+        ways = [self._mounting.get(name, (KEEP, KEEP)) for name, _ in self._around if name != PART]
+        return np.array(ways, dtype=np.int64).reshape(-1, 2)
+
+    @property
+    def beneath(self) -> Ints:
+        """The obstacles that are within the margin of the base."""
+        names = [name for name, _ in self._around if name != PART]
+        return np.array([row for row, name in enumerate(names) if name in self._mounting], dtype=np.int64)
 
     @property
     def links(self) -> list[int]:
@@ -164,6 +215,18 @@ def pairs_key(chain: Chain, camera: Floats) -> str:
     """Return the content key of everything that decides which parts of the arm can touch."""
     shapes = [value for shape in chain.shapes for value in (shape.vertices, shape.faces, shape.link)]
     return content_key("self pairs 1", chain.placements[1:], chain.lower, chain.upper, camera, *shapes)
+
+
+def _encloses(part: Part, point: Floats) -> bool:
+    """Return whether a point (3,) lies inside a closed part: the solid angles of its triangles make up a sphere.
+
+    Source: A. Van Oosterom, J. Strackee, IEEE Trans. Biomed. Eng. 30, 1983.
+    """
+    a, b, c = np.moveaxis(part.triangles - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+    spread = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
+    return bool(abs(np.arctan2(volume, spread).sum()) > 1.99 * np.pi)
 
 
 def _mesh(vertices: Floats, faces: Ints) -> coal.BVHModelOBBRSS:

@@ -6,36 +6,30 @@ is turned so that its joint rotates about its own z axis, so that the kernels ne
     base_from_flange = placements[0] Rz(q0) placements[1] Rz(q1) … placements[r-1] Rz(q[r-1]) last_from_flange
 """
 
-import importlib.metadata
 import os
 import re
 import tempfile
 from dataclasses import dataclass
 from difflib import get_close_matches
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from netdesign.errors import EnvironmentProblem, InputError
+from netdesign.errors import InputError
 from netdesign.model.arrays import Bools, Floats, Ints, frozen
 from netdesign.model.frames import inverse, pose, skew
 from netdesign.model.task import RobotCell
 from netdesign.motion.shapes import triangles
 from netdesign.motion.urdf import prepared_urdf
 
-# Frame of the bare flange of the arms of example-robot-data; tool0 and flange are ROS-Industrial's names (REP 199).
-_FLANGES = {
-    "panda": "panda_link8",
-    "xarm7": "link_eef",
-    "kinova": "j2s6s200_end_effector",
-    "z1": "link06",
-}
+# ROS-Industrial's names (REP 199).
 _STANDARD_FLANGES = ("tool0", "flange")
+_NAMED = 12  # frames or joints that a message names
 # A continuous joint may turn for ever, its cables may not: one and a half turns to either side.
 _CONTINUOUS_LIMIT = 3.0 * np.pi
 _TURN = 2.0 * np.pi
+_MOST_TURNED = 4.0 * _TURN  # of a limit in a study: beyond it stand degrees
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,46 +84,6 @@ class Chain:
 
     def __len__(self) -> int:
         return len(self.joint_names)
-
-
-def find_robot(name: str) -> tuple[Path, tuple[Path, ...], str | None]:
-    """Return (URDF, package directories, flange frame) of a robot of example-robot-data.
-
-    The flange is None for a robot whose flange is not known here: the study then names ``tool_frame``.
-
-    Raises:
-        EnvironmentProblem: example-robot-data is not installed.
-        InputError: no such robot; names the nearest ones.
-    """
-    try:
-        files = importlib.metadata.files("example-robot-data") or []
-    except importlib.metadata.PackageNotFoundError:
-        raise EnvironmentProblem(
-            "robot models: expected the package example-robot-data, found none installed"
-        ) from None
-    known = {file.name.removesuffix(".urdf"): file for file in files if file.name.endswith(".urdf")}
-    found = known.get(f"{name}_robot") or known.get(name)
-    if found is None:
-        names = sorted({stem.removesuffix("_robot") for stem in known})
-        near = get_close_matches(name, names, n=4, cutoff=0.4) or ["ur3", "ur5", "ur10", *_FLANGES]
-        raise InputError(f"robot.name: expected a robot of example-robot-data ({', '.join(near)}, …), found {name!r}")
-    urdf = Path(str(found.locate())).resolve()
-    # package://example-robot-data/robots/… is resolved against the folder that holds the package's folder.
-    share = next(parent for parent in urdf.parents if parent.name == "share")
-    return urdf, (share,), _FLANGES.get(name, "tool0" if name.startswith("ur") else None)
-
-
-def mount(name: str) -> Floats:
-    """Return flange_from_cam (4, 4) m of the two camera mounts: "side" looks along flange y, "coaxial" along z.
-
-    Raises:
-        InputError: another name.
-    """
-    if name == "side":
-        return pose(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.array([0.0, 0.06, 0.06]))
-    if name == "coaxial":
-        return pose(np.eye(3), np.array([0.0, 0.0, 0.09]))
-    raise InputError(f'robot.camera_mount: expected "side" or "coaxial", found {name!r}')
 
 
 def load_chain(cell: RobotCell) -> Chain:
@@ -198,12 +152,20 @@ def _tool_frame(model: Any, cell: RobotCell) -> str:
     names = [frame.name for frame in model.frames if frame.type != pin.FrameType.JOINT]
     wanted = cell.tool_frame or next((name for name in _STANDARD_FLANGES if name in names), None)
     if wanted is None:
-        raise InputError(f"robot.tool_frame: expected the frame that carries the camera, one of {', '.join(names)}")
+        raise InputError(f"robot.tool_frame: expected the frame that carries the camera, one of {_few(names, names)}")
     if wanted not in names:
-        near = get_close_matches(wanted, names, n=3, cutoff=0.4)
-        hint = f" (nearest: {', '.join(near)})" if near else ""
-        raise InputError(f"robot.tool_frame: expected one of {', '.join(names)}; found {wanted!r}{hint}")
+        near = get_close_matches(wanted, names, n=_NAMED, cutoff=0.4)
+        hint = f" (nearest: {', '.join(near[:3])})" if near else ""
+        raise InputError(f"robot.tool_frame: expected one of {_few(names, near)}; found {wanted!r}{hint}")
     return wanted
+
+
+def _few(names: list[str], first: list[str]) -> str:
+    """Return names for a message: all when they are few, else some, those that are asked for and then the last."""
+    if len(names) <= _NAMED:
+        return ", ".join(names)
+    chosen = list(dict.fromkeys([*first[:_NAMED], *names[::-1]]))[:_NAMED]
+    return f"{', '.join(chosen)} and {len(names) - _NAMED} more"
 
 
 def _reduce(model: Any, geometry: Any, tool: str, cell: RobotCell) -> tuple[Any, Any, int]:
@@ -213,8 +175,15 @@ def _reduce(model: Any, geometry: Any, tool: str, cell: RobotCell) -> tuple[Any,
     rest = pin.neutral(model)
     for name, value in cell.lock.items():
         if name not in known:
-            raise InputError(f"robot.lock: expected one of {', '.join(known)}; found {name!r}")
+            raise InputError(
+                f"robot.lock: expected one of {_few(known, get_close_matches(name, known))}; found {name!r}"
+            )
         joint = model.joints[model.getJointId(name)]
+        if joint.nq == 1:
+            low, high = float(model.lowerPositionLimit[joint.idx_q]), float(model.upperPositionLimit[joint.idx_q])
+            if low < high and not low <= value <= high:
+                unit = "m" if joint.shortname().startswith("JointModelP") else "rad"
+                raise InputError(f"robot.lock.{name}: expected {low:g} to {high:g} {unit}, found {value:g}")
         rest[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
     locked = [index for index in range(1, model.njoints) if index not in moving or model.names[index] in cell.lock]
     reduced, (shapes,) = pin.buildReducedModel(model, [geometry], locked, rest)
@@ -268,6 +237,11 @@ def _limits(model: Any, names: tuple[str, ...], cell: RobotCell) -> tuple[Floats
             else (model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q])
         )
         low, high = cell.limits.get(name, (low, high))
+        if name in cell.limits and max(abs(low), abs(high)) > _MOST_TURNED:
+            raise InputError(
+                f"robot.limits_rad.{name}: expected radians, no more than four turns to either side, found"
+                f" [{low:g}, {high:g}]"
+            )
         if not (np.isfinite([low, high]).all() and low < high):
             source = "" if name in cell.limits else f" in {cell.urdf.name}; set robot.limits_rad"
             raise InputError(f"robot.limits_rad.{name}: expected low < high, found [{low:g}, {high:g}]{source}")

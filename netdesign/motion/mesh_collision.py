@@ -91,10 +91,10 @@ class MeshCell:
             solid.item.setTransform(coal.Transform3s(base_from_solid[:, :3], base_from_solid[:, 3]))
 
     def _stood_on(self, chain: Chain, part: Part | None) -> dict[str, tuple[int, int]]:
-        """Return how links 1 and 2 are tested against what the base stands on: KEEP, TOUCH or SKIP, see ``Body``.
+        """Return how links 1 and 2 are tested against what is near the base: KEEP, TOUCH or SKIP, see ``Body``.
 
-        The base is within the margin of it, and a link that comes no farther away at any angle of its joints cannot
-        keep the margin; a thing from which it can turn away is an obstacle like any other.
+        A link that is within the margin of it at every angle of its joints, as the base is, cannot keep the margin: the
+        base stands on it. A thing from which the link can turn away is an obstacle like any other.
         """
         q = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
         self.place(q)
@@ -125,7 +125,8 @@ class MeshCell:
                 far = not self._hits(2, item, self._near)
                 if far:
                     break
-            ways[name] = (KEEP if not all(near) else TOUCH if any(touching) else SKIP, KEEP if far else TOUCH)
+            turns_away = any(near) and not all(near)
+            ways[name] = (KEEP if turns_away else TOUCH if any(touching) else SKIP, KEEP if far else TOUCH)
         return ways
 
     def _hits(self, link: int, item: coal.CollisionObject, request: coal.CollisionRequest) -> bool:

@@ -17,6 +17,7 @@ from netdesign.files.robot_program import (
 )
 from netdesign.files.store import write_bytes, write_json, write_text
 from netdesign.model.task import Task
+from netdesign.motion.program import PART_COLOUR, Solid
 from netdesign.photogrammetry.collinearity import project
 from netdesign.photogrammetry.visibility import sightings
 from netdesign.run_folder import open_run
@@ -29,7 +30,8 @@ def export(run: Path, network_id: int, format: Format, out: Path) -> Path:
 
     Args:
         format: json, csv: stations and joints; colmap: a text model with the predicted observations (a folder);
-            urscript, ros2: a program that drives the tour; glb: the cell with the arm at the first station.
+            urscript, ros2: a program that drives the tour; glb: the cell with the arm at the first station, of a study
+            without a robot the part and the stations.
 
     Raises:
         InputError: no such run or network; a robot program of a study without a robot.
@@ -55,6 +57,10 @@ def _without_robot(task: Task, network: PlannedNetwork, format: Format, out: Pat
         write_text(out, stations_csv(network.viewpoints, network.world_from_cam, None, ()))
     elif format == "json":
         write_json(out, "program", {"study": task.study.name, "stations": _stations(network)}, task.sha256)
+    elif format == "glb":
+        part = task.scene.part
+        solid = Solid(name="part", vertices=part.vertices, faces=part.faces, colour=PART_COLOUR)
+        write_bytes(out, cell_glb((solid,), network.world_from_cam, _half_field(task)))
     else:
         raise InputError(f"--format {format}: expected a study with a [robot] table, found none in {task.study.name}")
 
@@ -73,13 +79,8 @@ def _with_robot(task: Task, network: PlannedNetwork, format: Format, out: Path) 
         write_text(out, text)
         return
     if format == "glb":
-        camera = task.camera
-        view = (
-            0.5 * camera.width_px / float(camera.focal_px[0]),
-            0.5 * camera.height_px / float(camera.focal_px[1]),
-        )
         solids = cell_geometry(joint_map.arm, task.scene.part, network.joints[0])
-        write_bytes(out, cell_glb(solids, network.world_from_cam, view))
+        write_bytes(out, cell_glb(solids, network.world_from_cam, _half_field(task)))
         return
     program = program_of(joint_map, network.joints, network.vias)
     if format == "json":
@@ -89,6 +90,12 @@ def _with_robot(task: Task, network: PlannedNetwork, format: Format, out: Path) 
         write_text(out, urscript(program, network.id))
     else:
         write_text(out, joint_trajectory_yaml(program, sampled(program)))
+
+
+def _half_field(task: Task) -> tuple[float, float]:
+    """Half the width and height of the image at unit depth."""
+    width, height = 0.5 * np.array([task.camera.width_px, task.camera.height_px]) / task.camera.focal_px
+    return float(width), float(height)
 
 
 def _stations(network: PlannedNetwork) -> list[dict[str, object]]:

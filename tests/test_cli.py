@@ -4,11 +4,15 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+import trimesh
 
 from netdesign.environment import prepare_environment
 from netdesign.errors import InputError
 from netdesign.export import export
+from netdesign.files.design_json import find_network
+from netdesign.run_folder import open_run
 from tests.runs import ring_run
 
 
@@ -97,3 +101,15 @@ def test_help_of_a_command_loads_no_heavy_library(command):
         "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
     )
     subprocess.run([sys.executable, "-c", code, command], check=True, capture_output=True)
+
+
+def test_the_glb_of_a_study_without_a_robot_holds_part_and_stations(tmp_path):
+    ring_run(tmp_path / "run")
+    path = export(tmp_path / "run", 0, "glb", tmp_path / "cell.glb")
+    scene = trimesh.load(path)
+    task, network = open_run(tmp_path / "run"), find_network(tmp_path / "run", 0)
+    assert sorted(scene.geometry) == sorted(["part", *(f"station_{i}" for i in range(len(network.viewpoints)))])
+    x, y, z = task.scene.part.vertices.T  # z up becomes glTF's y up
+    np.testing.assert_allclose(scene.geometry["part"].bounds[1], [x.max(), z.max(), -y.min()], atol=1e-6)
+    with pytest.raises(InputError, match=r"urscript: expected a study with a \[robot\] table"):
+        export(tmp_path / "run", 0, "urscript", tmp_path / "program.script")

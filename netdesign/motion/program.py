@@ -17,6 +17,7 @@ from netdesign.motion.timing import leg_law
 
 # The sampled trajectory stays this far inside speed and acceleration, for the rounding of its numbers.
 _HEADROOM = 1e-4
+PART_COLOUR = (205, 170, 110)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,7 +202,7 @@ def cell_geometry(arm: ArmCell, part: Part | None, joints: Floats) -> tuple[Soli
     body, faces = _box(np.array([0.0, 0.0, -half[2]]), half)
     solids.append(Solid(name="camera", vertices=transform(camera, body), faces=faces, colour=(40, 40, 45)))
     if part is not None:
-        solids.append(Solid(name="part", vertices=part.vertices, faces=part.faces, colour=(205, 170, 110)))
+        solids.append(Solid(name="part", vertices=part.vertices, faces=part.faces, colour=PART_COLOUR))
     for index, box in enumerate(arm.body.boxes):
         corners, faces = _box(box[:3], box[3:])
         solids.append(Solid(name=f"obstacle_{index + 1}", vertices=corners, faces=faces, colour=(190, 190, 185)))

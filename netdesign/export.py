@@ -29,7 +29,7 @@ def export(run: Path, network_id: int, format: Format, out: Path) -> Path:
     """Write one network of a run directory and return where.
 
     Args:
-        format: json, csv: stations and joints; colmap: a text model with the predicted observations (a folder);
+        format: json, csv: stations, joints, via points; colmap: a text model with predicted observations (a folder);
             urscript, ros2: a program that drives the tour; glb: the cell with the arm at the first station, of a study
             without a robot the part and the stations.
 
@@ -75,8 +75,8 @@ def _with_robot(task: Task, network: PlannedNetwork, format: Format, out: Path) 
     joint_map = JointMap.build(task.cell, task.sphere, task.scene.part)
     chain = joint_map.arm.chain
     if format == "csv":
-        text = stations_csv(network.viewpoints, network.world_from_cam, network.joints, chain.joint_names)
-        write_text(out, text)
+        names = chain.joint_names
+        write_text(out, stations_csv(network.viewpoints, network.world_from_cam, network.joints, names, network.vias))
         return
     if format == "glb":
         solids = cell_geometry(joint_map.arm, task.scene.part, network.joints[0])

@@ -13,6 +13,7 @@ from netdesign.motion.options import search_options
 from netdesign.motion.plan import plan_on
 from netdesign.placement.finish import finish
 from netdesign.placement.free_problem import FreeProblem, problem_of
+from netdesign.placement.known_stations import KnownStations
 from netdesign.search.engine import run
 from tests.cells import arm, cell, joint_map, reachable_viewpoints
 from tests.scenes import plate_scene, sphere
@@ -101,3 +102,15 @@ def test_the_map_of_shells_says_what_the_exact_solution_says():
     told = np.array([reason == "free" for reason in of_shell.reasons(viewpoints)])
     assert (told & ~free).mean() < 0.005
     assert (free & ~told).mean() < 0.05
+
+
+def test_a_station_at_the_centre_itself_has_a_tour():
+    known = KnownStations.build(moving_task(depth=SHELL))
+    network = known.of(known.task.sphere.sample(np.radians(15.0))[0])
+    network = [station for station in network if len(station.joints)][:6]
+    centre = known.task.sphere.centre
+    lengths = [
+        known.tour([*network[:2], replace(network[2], place=place), *network[3:]])[0]
+        for place in (centre, centre + [1e-9, 0, 0])
+    ]
+    assert lengths[0] == lengths[1] > 0.0

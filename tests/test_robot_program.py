@@ -1,5 +1,6 @@
 """Robot programs: what is written keeps the limits, meets the design, and touches nothing."""
 
+import csv
 import itertools
 import json
 import re
@@ -12,6 +13,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from netdesign.files.robot_program import cell_glb, joint_trajectory_yaml, stations_csv, urscript
+from netdesign.files.stations import parse_stations, stations_table
 from netdesign.motion.plan import plan_on
 from netdesign.motion.program import camera_poses, cell_geometry, program_of, sampled
 from tests.cells import PART, joint_map, reachable_viewpoints
@@ -120,6 +122,23 @@ def test_csv_has_a_row_per_station(planned):
     np.testing.assert_allclose(
         Rotation.from_quat(values[:, 12:]).as_matrix(), plan.world_from_cam[:, :3, :3], atol=1e-12
     )
+
+
+def test_csv_has_the_via_points_behind_the_station_they_leave(planned, tmp_path):
+    _, plan, program = planned
+    names, joints = program.arm.chain.joint_names, plan.tour.joints
+    straight = list(csv.reader(stations_csv(plan.viewpoints, plan.world_from_cam, joints, names).splitlines()))
+    vias = {2: joints[2:4] + 0.125, 5: joints[5:6] / 3}
+    text = stations_csv(plan.viewpoints, plan.world_from_cam, joints, names, vias)
+    rows = list(csv.reader(text.splitlines()))
+    assert [row[:-1] for row in rows] == straight
+    assert rows[0][-1] == "vias_to_next_rad"
+    for number, row in enumerate(rows[1:]):
+        points = [[float(value) for value in point.split()] for point in row[-1].split("|") if point.strip()]
+        np.testing.assert_array_equal(np.reshape(points, (-1, 6)), vias.get(number, np.zeros((0, 6))))
+    (tmp_path / "s.csv").write_text(text)
+    poses = parse_stations(stations_table("s.csv", tmp_path), tmp_path / "s.csv")
+    np.testing.assert_allclose(poses, plan.world_from_cam, atol=1e-12)
 
 
 def test_glb_holds_the_cell(planned):

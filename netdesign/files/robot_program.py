@@ -6,7 +6,8 @@ the robot's controller uses (ROS-Industrial's "base"; for Universal Robots turne
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,16 +23,27 @@ MM = 1e-3
 _FRUSTUM = 0.06  # m, depth of the camera pyramids in the cell model
 
 
-def stations_csv(viewpoints: Floats, world_from_cam: Floats, joints: Floats | None, names: Sequence[str]) -> str:
+def stations_csv(
+    viewpoints: Floats,
+    world_from_cam: Floats,
+    joints: Floats | None,
+    names: Sequence[str],
+    vias: Mapping[int, Floats] = MappingProxyType({}),
+) -> str:
     """Return one row per station: order, viewpoint, joints, camera position in mm and quaternion x, y, z, w.
+
+    A tour with via points has one more column, vias_to_next_rad: the joints to drive over on the way to the next row,
+    a space between joints, a bar between points, empty where the straight joint line is free.
 
     Args:
         viewpoints: (n, 2) rad.  world_from_cam: (n, 4, 4) m.  joints: (n, r) rad, or None.  names: of the joints.
+        vias: (k, r) rad by number of the leg; leg i leaves station i.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     columns = [f"{name}_rad" for name in names] if joints is not None else []
-    writer.writerow(["order", "alpha_deg", "beta_deg", *columns, "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"])
+    more = ["vias_to_next_rad"] if vias else []
+    writer.writerow(["order", "alpha_deg", "beta_deg", *columns, "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw", *more])
     quaternions = quaternion_xyzw(world_from_cam[:, :3, :3])
     for index in range(len(viewpoints)):
         values = [
@@ -40,7 +52,10 @@ def stations_csv(viewpoints: Floats, world_from_cam: Floats, joints: Floats | No
             *(world_from_cam[index, :3, 3] / MM),
             *quaternions[index],
         ]
-        writer.writerow([index, *(repr(float(value)) for value in values)])
+        row = [index, *(repr(float(value)) for value in values)]
+        if vias:
+            row.append(" | ".join(" ".join(repr(float(value)) for value in via) for via in vias.get(index, ())))
+        writer.writerow(row)
     return text.getvalue()
 
 

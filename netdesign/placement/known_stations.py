@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from netdesign.model.arrays import Bools, Floats
+from netdesign.model.frames import sphere_directions, viewpoints_of
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.motion.joint_lookup import LANES
@@ -111,8 +112,8 @@ class KnownStations:
             options = np.zeros((len(rows), network[rows[0]].joints.shape[1], -(-int(count.max()) // LANES) * LANES))
             for own, row in zip(options, rows, strict=True):
                 own[:, : len(network[row].joints)] = network[row].joints.T
-            directions = places[rows] - self.task.sphere.centre
-            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+            # Over the angles: a station may stand at the centre itself.
+            directions = sphere_directions(viewpoints_of(places[rows] - self.task.sphere.centre))
             law, timed, work = self.joint.law, self.joint.timed, work_for(*options.shape)
             length = float(options_tour(options, count, directions, NO_LABEL, NOTHING, law, timed, work))
         return length + self.joint.dwell * len(network), len(network) - len(rows)

@@ -21,6 +21,7 @@ from netdesign.placement.distances import named_ends
 from netdesign.placement.preparation import free_slots, joint_map_of
 
 RARELY_SEEN = 0.05
+METRES = 2.0  # mm: a camera that is nearer to its flange was probably given in metres
 ON_SURFACE = 0.2  # of an edge: a flat tag on a cylinder whose diameter is twice its edge stays below (0.12)
 
 
@@ -114,6 +115,9 @@ def _record(
         "proved": seen.proved,
         "max_images": seen.max_images,
         "robot": reach,
+        "camera_off_flange_mm": None
+        if task.cell is None
+        else float(np.linalg.norm(task.cell.flange_from_cam[:3, 3])) * 1e3,
         "problems": problems,
     }
 
@@ -167,5 +171,10 @@ def _text(record: dict[str, Any]) -> str:
     if record["robot"] is not None:
         parts = "  ".join(f"{name} {share:.1%}" for name, share in record["robot"].items() if share > 0)
         lines.append(f"robot      {parts} of the {place}")
+        if 0.0 < record["camera_off_flange_mm"] < METRES:
+            lines.append(
+                f"  the camera is {record['camera_off_flange_mm']:.3g} mm from the flange, inside it:"
+                " robot.flange_from_cam_mm takes millimetres"
+            )
     lines.append("feasible   nothing is proved against it" if not record["problems"] else "infeasible")
     return "\n".join(lines)

@@ -157,3 +157,11 @@ def test_the_main_job_runs_on_a_user_s_arm_of_seven_joints(tmp_path):
     assert "failed" not in verdicts
     assert (run / "report.html").is_file()
     assert {"cell.png", "reach.png"} <= {path.name for path in (run / "figures").iterdir()}
+
+
+def test_a_camera_mount_in_metres_is_noticed(tmp_path):
+    mount = "flange_from_cam_mm = [[1, 0, 0, {}], [0, 1, 0, 0], [0, 0, 1, {}], [0, 0, 0, 1]]"
+    for values, noticed in (((0.06, 0.08), True), ((60, 80), False), ((0, 0), False)):
+        robot = 'tool_frame = "plate"\n' + mount.format(*values)
+        text = check_study(study(tmp_path, arm(), robot)).text
+        assert ("the camera is 0.1 mm from the flange" in text) is noticed

@@ -23,7 +23,7 @@ from netdesign.model.arrays import Floats
 from netdesign.model.camera import Camera, CornerNoise
 from netdesign.model.frames import look_at, sphere_directions
 from netdesign.model.progress import Progress, silent
-from netdesign.model.scene import CORNERS_PER_TAG, Part, Scene, Targets
+from netdesign.model.scene import CORNERS_PER_TAG, FAMILIES, Part, Scene, Targets
 from netdesign.photogrammetry.collinearity import project
 from netdesign.photogrammetry.precision import corner_rms
 from netdesign.truth import camera_record
@@ -68,9 +68,11 @@ class NoiseCalibration:
     """The detector's noise: the closed form's two numbers and the evidence.
 
     Attributes:
+        family: of the tags.
         ratios: (cells,) measured / predicted sigma per cell, systematic error and noise together.
     """
 
+    family: str
     noise: CornerNoise
     cells: tuple[NoiseCell, ...]
     ratios: tuple[float, ...]
@@ -87,9 +89,10 @@ def calibrate_study(study: Path, output: Path, progress: Progress = silent, work
     """
     task = load_task(study)
     demand_writable(output)
+    family = task.scene.targets.family
     shoot = Shoot(seed=task.study.seed, supersample=task.study.validation.supersample)
     with worker_pool(workers) as executor:
-        found = calibrate_noise(task.camera, shoot, executor=executor, progress=progress)
+        found = calibrate_noise(task.camera, shoot, family=family, executor=executor, progress=progress)
     write_calibration(output, found, task.camera, shoot)
     ratios = np.array(found.ratios)
     lines = [
@@ -102,26 +105,27 @@ def calibrate_study(study: Path, output: Path, progress: Progress = silent, work
 
 
 def calibrate_noise(
-    camera: Camera, shoot: Shoot, *, sides_px: Sequence[float] = SIDES_PX,
+    camera: Camera, shoot: Shoot, *, family: str = "tag36h11", sides_px: Sequence[float] = SIDES_PX,
     incidences_deg: Sequence[float] = INCIDENCES_DEG, replicates: int = REPLICATES,
     executor: Executor | None = None, progress: Progress = silent,
 ) -> NoiseCalibration:  # fmt: skip
     """Measure the detector with a camera's blur and sensor.
 
     Args:
-        camera: its blur, full well and read noise are used, not its geometry.
+        camera: its blur, full well and read noise are used, not its geometry.  family: of the tags.
 
     Raises:
         EnvironmentProblem: rendering is not possible here.
         InputError: no tag is found anywhere on the grid.
     """
+    count = FAMILIES[family].cells
     grid = [
         (side, incidence)
         for side in sides_px
         for incidence in incidences_deg
-        if side * np.cos(np.radians(incidence)) / 8 >= SMALLEST_CELL_PX
+        if side * np.cos(np.radians(incidence)) / count >= SMALLEST_CELL_PX
     ]
-    jobs = [(camera, shoot, side, incidence, replicates, index) for index, (side, incidence) in enumerate(grid)]
+    jobs = [(camera, shoot, family, side, incidence, replicates, index) for index, (side, incidence) in enumerate(grid)]
     results = list(each(_measure_cell, jobs, executor, "calibrate", progress))
     cells = [cell for cell, _, _ in results]
     usable = [cell for cell in cells if cell.tags >= 2 * replicates]
@@ -134,7 +138,8 @@ def calibrate_noise(
     measured = [np.hypot(cell.noise_px, cell.systematic_px) for cell in finished]
     predicted = [np.hypot(k * cell.shape_px, floor) for cell in finished]
     return NoiseCalibration(
-        noise=CornerNoise(k=k, floor_px=floor),
+        family=family,
+        noise=CornerNoise(k=k, floor_px=floor, cells=count),
         cells=tuple(finished),
         ratios=tuple(float(a / b) for a, b in zip(measured, predicted, strict=True)),
         warnings=tuple(_warnings(finished)),
@@ -155,6 +160,7 @@ def write_calibration(path: Path, found: NoiseCalibration, camera: Camera, shoot
     """Write a calibration (kind noise), which ``files.noise.read_corner_noise`` reads."""
     record = camera_record(camera)
     payload: dict[str, Any] = {
+        "family": found.family,
         "k": found.noise.k,
         "floor_px": found.noise.floor_px,
         "camera": {name: record[name] for name in ("blur_px", "full_well_e", "read_noise_e")},
@@ -170,11 +176,11 @@ def write_calibration(path: Path, found: NoiseCalibration, camera: Camera, shoot
     write_json(path, "noise", payload)
 
 
-def _measure_cell(job: tuple[Camera, Shoot, float, float, int, int]) -> tuple[NoiseCell, Floats, Floats]:
+def _measure_cell(job: tuple[Camera, Shoot, str, float, float, int, int]) -> tuple[NoiseCell, Floats, Floats]:
     """Render one size and incidence; return the cell, errors (k, 8) px and covariances (k, 8, 8) px²."""
-    camera, shoot, side, incidence_deg, replicates, index = job
+    camera, shoot, family, side, incidence_deg, replicates, index = job
     random = np.random.default_rng([shoot.seed, 7, index])
-    scene = _tag_field(random)
+    scene = _tag_field(random, family)
     bench = _bench_camera(camera, side)
     tilt = np.array([random.uniform(-np.pi, np.pi), np.pi / 2 - np.radians(incidence_deg)])
     distance = FOCAL_PX * TAG_SIZE_M / side
@@ -205,7 +211,8 @@ def _measure_cell(job: tuple[Camera, Shoot, float, float, int, int]) -> tuple[No
     outward = truth - truth.mean(axis=1, keepdims=True)
     outward /= np.linalg.norm(outward, axis=2, keepdims=True)
     inward = -np.einsum("kcx,kcx->kc", e.reshape(-1, 4, 2), outward[np.array(of_tag, dtype=np.int64)])
-    shape = corner_rms(replace(bench, corner_noise=CornerNoise(k=1.0, floor_px=0.0)), side, np.radians(incidence_deg))
+    plain = CornerNoise(k=1.0, floor_px=0.0, cells=scene.targets.cells)
+    shape = corner_rms(replace(bench, corner_noise=plain), side, np.radians(incidence_deg))
     bias = e.reshape(-1, 2).mean(axis=0) if len(e) else np.full(2, np.nan)
     cell = NoiseCell(
         side_px=side, incidence_deg=incidence_deg, tags=len(e), missed=missed, rejected=rejected,
@@ -246,16 +253,16 @@ def _warnings(cells: Sequence[NoiseCell]) -> list[str]:
     return found
 
 
-def _tag_field(random: np.random.Generator) -> Scene:
+def _tag_field(random: np.random.Generator, family: str) -> Scene:
     """Return a plate with ACROSS x DOWN tags at z = 0, each turned at random about its normal."""
     pitch = 2.0 * TAG_SIZE_M  # the quiet zone's diagonal fits
     columns, rows = np.meshgrid(np.arange(ACROSS) - (ACROSS - 1) / 2, np.arange(DOWN) - (DOWN - 1) / 2)
     centres = np.stack([columns.ravel(), rows.ravel(), np.zeros(columns.size)], axis=1) * pitch
     turn = random.uniform(-np.pi, np.pi, len(centres))
     targets = Targets(
-        ids=random.choice(587, len(centres), replace=False), centres=centres,
+        ids=random.choice(FAMILIES[family].ids, len(centres), replace=False), centres=centres,
         normals=np.tile([0.0, 0.0, 1.0], (len(centres), 1)),
-        x_axes=np.stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))], axis=1), size_m=TAG_SIZE_M,
+        x_axes=np.stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))], axis=1), size_m=TAG_SIZE_M, family=family,
     )  # fmt: skip
     half = 0.55 * pitch * np.array([ACROSS, DOWN])
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half

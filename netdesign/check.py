@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from netdesign.errors import InfeasibleError
-from netdesign.files.parts import TAG_COUNT
 from netdesign.files.study import load_task
 from netdesign.imaging.plausible import fold_radius_px, image_radius_px
 from netdesign.model.progress import Progress, silent
-from netdesign.model.scene import CORNERS_PER_TAG
+from netdesign.model.scene import CORNERS_PER_TAG, FAMILIES
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
 from netdesign.photogrammetry.connectivity import listed
@@ -99,7 +98,7 @@ def _record(
         "tags": len(targets.ids),
         "points": len(targets.points),
         "left_out": list(task.left_out),
-        "ids_used_up": task.study.targets.spacing_mm is not None and placed == TAG_COUNT[targets.family],
+        "ids_used_up": task.study.targets.spacing_mm is not None and placed == FAMILIES[targets.family].ids,
         "gap_mm": gaps,
         "tag_mm": task.study.targets.size_mm,
         "fold_px": fold_radius_px(task.camera.intrinsics),

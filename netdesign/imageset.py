@@ -123,7 +123,7 @@ def measure_images(
         InputError: a picture cannot be read or is not of the camera's size.
     """
     if floor_px is None:
-        floor_px = (camera.corner_noise or read_corner_noise(None)).floor_px
+        floor_px = (camera.corner_noise or read_corner_noise(None, targets.family)).floor_px
     jobs = [(path, camera, targets, gates, floor_px, gamma) for path in paths]
     return list(each(_measure_one, jobs, executor, "measure", progress))
 

@@ -35,13 +35,13 @@ def light():
 
 def test_homography_maps_the_square_and_its_derivative_is_right():
     corners = np.array([[10.0, 12], [90, 20], [80, 95], [5, 85]])
-    matrix, change = homography(corners)
-    mapped = np.column_stack([SQUARE, np.ones(4)]) @ matrix.T
+    matrix, change = homography(corners, 8)
+    mapped = np.column_stack([8 * SQUARE, np.ones(4)]) @ matrix.T
     np.testing.assert_allclose(mapped[:, :2] / mapped[:, 2:], corners, atol=1e-9)
     for index in range(8):
         step = np.zeros(8)
         step[index] = 1e-5
-        ahead, behind = (homography(corners + sign * step.reshape(4, 2))[0].ravel()[:8] for sign in (1, -1))
+        ahead, behind = (homography(corners + sign * step.reshape(4, 2), 8)[0].ravel()[:8] for sign in (1, -1))
         np.testing.assert_allclose((ahead - behind) / 2e-5, change[:, index], rtol=1e-5, atol=1e-9)
 
 
@@ -84,14 +84,14 @@ def test_lens_inverse_and_derivative():
 def test_coverage_of_sub_pixels_adds_up_to_the_cells_area():
     pattern = cells("tag36h11", 5)
     corners = np.array([[20.3, 14.1], [75.2, 22.7], [66.8, 80.9], [12.4, 70.3]])
-    tag_from_px = np.linalg.inv(homography(corners)[0])
+    tag_from_px = np.linalg.inv(homography(corners, 8)[0])
     x, y = np.meshgrid((np.arange(200) + 0.5) / 2 - 0.5, (np.arange(200) + 0.5) / 2 - 0.5)
     layers = np.empty((2, 200, 200))
     cover(x, y, tag_from_px, pattern, 0.5, layers)
     assert layers.min() > -1e-3  # the term for the shear is of first order
     assert (layers.sum(axis=0) < 1 + 1e-3).all()
     dark = ((1 - layers.sum(axis=0)) / 4).sum()
-    to_px = homography(corners)[0]
+    to_px = homography(corners, 8)[0]
     expected = sum(_area(to_px, column, row) for row in range(8) for column in range(8) if pattern[row, column] == 0)
     assert dark == pytest.approx(expected, rel=2e-3)
 

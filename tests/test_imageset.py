@@ -224,7 +224,7 @@ def test_kalibr_grid_only_for_a_flat_grid():
 
 
 def test_the_shipped_noise_model_was_measured():
-    noise = read_corner_noise(None)
+    noise = read_corner_noise(None, "tag36h11")
     assert 2.5 < noise.k < 4.0
     assert 0.0003 < noise.floor_px < 0.004
 

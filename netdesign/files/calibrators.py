@@ -32,10 +32,12 @@ def kalibr_camchain(camera: Camera) -> str:
 
 
 def kalibr_grid(targets: Targets) -> str | None:
-    """Return Kalibr's aprilgrid.yaml, or None when the tags are not one flat, evenly spaced, parallel grid.
+    """Return Kalibr's aprilgrid.yaml, or None when the tags are not one flat, evenly spaced, parallel grid of tag36h11.
 
     Kalibr counts tags row by row from the lower left; sets with other numbers give its grid all the same, for its size.
     """
+    if targets.family != "tag36h11":  # the only one that Kalibr looks for
+        return None
     across, normal = targets.x_axes[0], targets.normals[0]
     upward = np.cross(normal, across)
     offset = targets.centres - targets.centres[0]

@@ -10,14 +10,12 @@ from netdesign.errors import InputError
 from netdesign.files.csv_table import csv_rows
 from netdesign.model.arrays import Floats
 from netdesign.model.frames import transform
-from netdesign.model.scene import Part, Targets
+from netdesign.model.scene import FAMILIES, Part, Targets
 
 UNIT_M = {"mm": 1e-3, "m": 1.0, "inch": 0.0254}
 TAG_COLUMNS = ("tag", "x_mm", "y_mm", "z_mm", "nx", "ny", "nz", "ux", "uy", "uz")
-TAG_COUNT = {"tag36h11": 587}
 CAD = {".step", ".stp", ".iges", ".igs", ".brep", ".sldprt", ".ipt", ".catpart", ".prt", ".x_t", ".fcstd"}
 PHASES = 12  # steps of a spacing by which a grid is moved to make tags fit
-CELLS_PER_TAG = 8  # the black square of 36h11 is 8 cells wide; one white cell around it is the quiet zone
 
 
 def load_part(path: Path, unit: str, world_from_mesh: Floats) -> Part:
@@ -72,8 +70,9 @@ def load_targets(path: Path, family: str, size_m: float, world_from_mesh: Floats
             tag, values = _whole_number(line["tag"]), np.array([float(line[name]) for name in TAG_COLUMNS[1:]])
         except (TypeError, ValueError):
             raise InputError(f"{where}: expected an integer and nine numbers, found {list(line.values())}") from None
-        if not 0 <= tag < TAG_COUNT[family]:
-            raise InputError(f"{where}: expected a tag id from 0 to {TAG_COUNT[family] - 1} of {family}, found {tag}")
+        last = FAMILIES[family].ids - 1
+        if not 0 <= tag <= last:
+            raise InputError(f"{where}: expected a tag id from 0 to {last} of {family}, found {tag}")
         if tag in tags:
             raise InputError(f"{where}: tag {tag} stands in the list twice")
         centre, normal, x_axis = values.reshape(3, 3)
@@ -122,7 +121,8 @@ def spread_targets(part: Part, family: str, size_m: float, spacing_m: float) -> 
     Raises:
         InputError: no face has room for a tag, or the spacing is smaller than a tag with its quiet zone.
     """
-    outer = size_m * (CELLS_PER_TAG + 2) / CELLS_PER_TAG
+    cells = FAMILIES[family].cells
+    outer = size_m * (cells + 2) / cells  # one white cell around the black square
     if spacing_m < outer:
         raise InputError(
             f"targets.spacing_mm: expected at least {outer * 1e3:g} (tag and quiet zone), found {spacing_m * 1e3:g}"
@@ -139,7 +139,7 @@ def spread_targets(part: Part, family: str, size_m: float, spacing_m: float) -> 
             normal = np.asarray(mesh.face_normals[groups[index][0]])
             places = _grid(part.triangles[groups[index]], normal, spacing_m, outer, moved)
             found += [(centre, normal, x_axis) for centre, x_axis in places]
-    found = found[: TAG_COUNT[family]]
+    found = found[: FAMILIES[family].ids]
     if not found:
         raise InputError(
             f"targets.spacing_mm: no flat face of the part has room for a tag of {outer * 1e3:g} mm with its quiet "

@@ -14,10 +14,10 @@ from pydantic import ValidationError
 
 from netdesign.errors import InputError
 from netdesign.files.csv_table import csv_rows
-from netdesign.files.parts import TAG_COUNT, load_targets
+from netdesign.files.parts import load_targets
 from netdesign.files.study_text import first_problem, read_toml
 from netdesign.model.camera import Camera
-from netdesign.model.scene import Targets
+from netdesign.model.scene import FAMILIES, Targets
 from netdesign.model.study import CameraTable
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
@@ -72,9 +72,9 @@ def read_camera_and_targets(folder: Path) -> tuple[Camera, Targets, bool]:
     )
     tags = content.get("targets", {}) if "camera" in content else {}
     family = tags.get("family", "tag36h11")
-    if family not in TAG_COUNT:
-        raise InputError(f"{path}: targets.family: expected one of {', '.join(TAG_COUNT)}, found {family!r}")
-    size, ids = tags.get("size_mm"), np.arange(TAG_COUNT[family])
+    if family not in FAMILIES:
+        raise InputError(f"{path}: targets.family: expected one of {', '.join(FAMILIES)}, found {family!r}")
+    size, ids = tags.get("size_mm"), np.arange(FAMILIES[family].ids)
     if (folder / "tags.csv").is_file():
         ids, size = _tag_list(folder / "tags.csv")
     if not (isinstance(size, int | float) and size > 0):

@@ -16,7 +16,7 @@ from netdesign.imaging.photograph import RendererName, Shoot
 from netdesign.model.arrays import Floats
 from netdesign.model.camera import Camera
 from netdesign.model.frames import look_at, pose, rotation_from_rpy, sphere_directions
-from netdesign.model.scene import Part, Scene, Targets
+from netdesign.model.scene import FAMILIES, Part, Scene, Targets
 from netdesign.model.study import CameraTable, NotNegative, Number, Range, Table, Vector3
 from netdesign.model.task import VisibilityLimits
 
@@ -146,7 +146,7 @@ def load_recipe(path: Path, renderer: RendererName = "pyrender") -> ImageSetPlan
     task = load_task(path.parent / recipe.study)
     table = task.study.camera.model_dump() | recipe.camera
     try:
-        camera = camera_of_table(CameraTable.model_validate(table), path)
+        camera = camera_of_table(CameraTable.model_validate(table), path, task.scene.targets.family)
     except ValidationError as error:
         raise InputError(f"{path}: camera.{first_problem(error, CameraTable)}") from None
     if recipe.exposure.depth_of_field or recipe.exposure.diffraction:
@@ -201,7 +201,7 @@ def _with_faults(
 ) -> tuple[Scene, tuple[Scene, ...]]:
     """Return the scene as claimed, with clutter that may hide tags, and per image the scene as drawn."""
     part, targets = scene.part, scene.targets
-    foreign = np.setdiff1d(np.arange(587), targets.ids)[: faults.clutter]
+    foreign = np.setdiff1d(np.arange(FAMILIES[targets.family].ids), targets.ids)[: faults.clutter]
     centres, heights = [], []
     low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
     reach = float(np.linalg.norm(high - low)) / 2

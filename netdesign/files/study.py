@@ -143,7 +143,7 @@ def load_task(path: Path, seed: int | None = None) -> Task:
     sphere = _sphere(study.viewpoints)
     _check_clearance(part, sphere, part_table, path)  # before tags are spread over a part in the wrong unit
     scene = Scene(part=part, targets=_targets(study, path, part, world_from_mesh))
-    camera, limits = camera_of_table(study.camera, path), _limits(study.visibility)
+    camera, limits = camera_of_table(study.camera, path, study.targets.family), _limits(study.visibility)
     scene, left_out = _worth_measuring(study, path, scene, camera, sphere, limits)
     return Task(
         study=resolved.study,
@@ -204,11 +204,11 @@ def _worth_measuring(
     return replace(scene, targets=scene.targets.take(kept)), tuple(ids.tolist())
 
 
-def camera_of_table(table: CameraTable, path: Path) -> Camera:
-    """Return the camera of a [camera] table; ``path`` is the file that holds it."""
+def camera_of_table(table: CameraTable, path: Path, family: str) -> Camera:
+    """Return the camera of a [camera] table in the file ``path``, with the noise of a family of tags."""
     noise = None
     if table.noise == "detector":
-        noise = read_corner_noise(None if table.noise_file is None else _beside(path, table.noise_file))
+        noise = read_corner_noise(None if table.noise_file is None else _beside(path, table.noise_file), family)
     return Camera(
         width_px=table.width_px,
         height_px=table.height_px,

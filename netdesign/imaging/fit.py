@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 
 from netdesign.imaging.lens import ideal_pixels, measured_pixels
 from netdesign.imaging.pattern import blur, cover, further_box, kernel_reach, kernels
-from netdesign.imaging.tags import CELLS
 from netdesign.model.arrays import Floats
 from netdesign.model.compiled import FAST, entry
 
 UNKNOWNS = 14  # 8 of geometry, black, white, surround, light slope x and y, sigma
-SQUARE = np.array([[0.0, 0], [CELLS, 0], [CELLS, CELLS], [0, CELLS]])
+SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])  # corners of a tag of one cell
 START_SIGMA_PX = 0.9
 SURROUND_SIGMA = 0.3  # a priori, of the surround about white, in units of the contrast
 SLOPE_SIGMA = 0.3  # a priori, of the light's slope over half a tag
@@ -59,15 +58,19 @@ class Fit:
     iterations: int
 
 
-def homography(corners: Floats) -> tuple[Floats, Floats]:
-    """Return px_from_tag (3, 3) through four corners (4, 2) and the derivative (8, 8) of its h1…h8 by the corners."""
+def homography(corners: Floats, cells: int) -> tuple[Floats, Floats]:
+    """Return px_from_tag (3, 3) through the four corners (4, 2) of a tag of ``cells`` cells along its edge.
+
+    Also the derivative (8, 8) of its h1…h8 by the corners.
+    """
+    square = cells * SQUARE
     design, right = np.zeros((8, 8)), corners.reshape(8)
-    for index, ((u, v), (x, y)) in enumerate(zip(SQUARE, corners, strict=True)):
+    for index, ((u, v), (x, y)) in enumerate(zip(square, corners, strict=True)):
         design[2 * index] = (u, v, 1, 0, 0, 0, -u * x, -v * x)
         design[2 * index + 1] = (0, 0, 0, u, v, 1, -u * y, -v * y)
     inverse: Floats = np.asarray(np.linalg.inv(design), np.float64)
     h: Floats = inverse @ right
-    scale = SQUARE @ h[6:] + 1.0
+    scale = square @ h[6:] + 1.0
     return np.append(h, 1.0).reshape(3, 3), np.asarray(inverse * np.repeat(scale, 2))
 
 
@@ -83,7 +86,7 @@ def _normal_equations(
         picture: (r, c) grey levels.  centres: (r, c, 2) ideal pixels of the pixel centres.
         model: (5, r, c) from ``blur``.  px_from_ideal: (2, 2) derivative of measured by ideal pixels at the tag.
         levels: black, white, surround, slope x, slope y.
-        frame: centre x, y and half size of the tag (ideal px), rim in cells.  noise: gain, floor.
+        frame: centre x, y and half size of the tag (ideal px), rim in cells, cells along the tag.  noise: gain, floor.
         inside: (r, c) pixels that take part; chosen anew from tag coordinates when ``choose``.
 
     Returns:
@@ -91,7 +94,7 @@ def _normal_equations(
     """
     black, white, surround, slope_x, slope_y = levels
     h7, h8, m = px_from_tag[2, 0], px_from_tag[2, 1], tag_from_px
-    rim = frame[3]
+    rim, beyond = frame[3], frame[4] + frame[3]
     row = np.empty(14)
     normal[:] = 0.0
     right[:] = 0.0
@@ -103,7 +106,7 @@ def _normal_equations(
             u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) * scale
             v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) * scale
             if choose:
-                inside[r, c] = -rim <= u <= 8.0 + rim and -rim <= v <= 8.0 + rim
+                inside[r, c] = -rim <= u <= beyond and -rim <= v <= beyond
             if not inside[r, c]:
                 continue
             across, down = (x - frame[0]) / frame[2], (y - frame[1]) / frame[2]
@@ -216,16 +219,17 @@ def fit_tag(
     """Fit one tag.
 
     Args:
-        picture: (h, w) grey levels, linear in light.  cells: (8, 8), 1 white.
+        picture: (h, w) grey levels, linear in light.  cells: (n, n), 1 white.
         seed_px: (4, 2) corners to about a third of a cell, in the order of ``SQUARE``.  intrinsics: (8,).
         gain, floor: noise variance of a pixel is gain · level + floor, in grey levels².
     """
     corners = ideal_pixels(np.ascontiguousarray(seed_px, dtype=np.float64), intrinsics)
     edges = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
-    cell = float(edges.mean()) / CELLS
+    count = len(cells)
+    cell = float(edges.mean()) / count
     rim = float(np.clip(1.6 / cell, 0.5, 0.9))  # cells of the quiet zone that take part: the blur's reach
     middle, half = corners.mean(axis=0), 0.5 * float(edges.mean())
-    frame = np.array([*middle, half, rim])
+    frame = np.array([*middle, half, rim, float(count)])
     _, px_from_ideal = measured_pixels(middle[None], intrinsics)
     patch = _Patch(picture, seed_px, intrinsics, rim * cell + 2.0, 1.2)
     dark, bright = np.quantile(patch.grey, [0.1, 0.9])
@@ -237,7 +241,7 @@ def fit_tag(
     side = 1.0 / (SUBPIXELS * np.sqrt(abs(float(np.linalg.det(px_from_ideal[0])))))
     while iteration < max_iterations and not converged:
         iteration += 1
-        px_from_tag, change = homography(corners)
+        px_from_tag, change = homography(corners, count)
         tag_from_px = np.linalg.inv(px_from_tag)
         cover(patch.fine[..., 0], patch.fine[..., 1], tag_from_px, cells, side, patch.layers)
         taps = kernels(sigma, SUBPIXELS, min(kernel_reach(sigma, SUBPIXELS), patch.reach), _smoothed(corners))

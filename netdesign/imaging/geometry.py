@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from netdesign.imaging.looks import Appearance
-from netdesign.imaging.tags import CELLS, QUIET_CELLS
+from netdesign.imaging.tags import QUIET_CELLS
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.frames import inverse, transform
@@ -94,17 +94,18 @@ def tag_quads(targets: Targets, camera: Camera, cam_from_world: Floats) -> list[
     centres = transform(cam_from_world, targets.centres)
     right = targets.x_axes @ cam_from_world[:3, :3].T
     up = np.cross(targets.normals, targets.x_axes) @ cam_from_world[:3, :3].T
-    side = targets.size_m * (CELLS + 2 * QUIET_CELLS) / CELLS
+    whole = targets.cells + 2 * QUIET_CELLS
+    side = targets.size_m * whole / targets.cells
     facing = -np.einsum("ij,ij->i", targets.normals @ cam_from_world[:3, :3].T, centres)
     facing /= np.linalg.norm(centres, axis=1)
     focal, centre_px = camera.focal_px, camera.principal_point_px
     size = np.array([camera.width_px, camera.height_px])
     quads = []
     for tag in np.flatnonzero((facing > 0.01) & (centres[:, 2] > side)):
-        cell_px = float(focal.max() * targets.size_m / CELLS / (centres[tag, 2] - 0.7 * side))
+        cell_px = float(focal.max() * targets.size_m / targets.cells / (centres[tag, 2] - 0.7 * side))
         steps = 1
         if camera.distortion.any():
-            steps = int(np.ceil(cell_px * (CELLS + 2 * QUIET_CELLS) / TAG_STEP_PX))
+            steps = int(np.ceil(cell_px * whole / TAG_STEP_PX))
         uv = np.stack(np.meshgrid(*[np.linspace(0, 1, steps + 1)] * 2, indexing="xy"), axis=-1).reshape(-1, 2)
         offsets = (uv - 0.5) * side
         vertices = centres[tag] + offsets[:, :1] * right[tag] + offsets[:, 1:] * up[tag]

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from netdesign.imaging.detect import detect, pose_from_tag
 from netdesign.imaging.fit import Fit, fit_tag
-from netdesign.imaging.tags import CELLS, cells
+from netdesign.imaging.tags import cells
 from netdesign.model.arrays import Floats
 from netdesign.model.camera import Camera
+from netdesign.model.scene import FAMILIES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +20,7 @@ class Gates:
 
     Attributes:
         max_incidence: rad; beyond it the rendered textures, and real print, are no longer well known.
-        min_cell_px: shortest edge of the tag divided by 8.
+        min_cell_px: shortest edge of the tag divided by its cells.
         chi2_base, chi2_sigmas: largest chi²/dof is base + sigmas·sqrt(2/dof).
         max_seed_shift_cells: largest distance of a corner from its seed, in cells, at least ``min_seed_shift_px``.
         min_contrast: smallest (white - black) / full scale.
@@ -93,6 +94,7 @@ def measure(
     fits = [
         fit_tag(picture, cells(family, seed.tag_id), seed.corners_px, camera.intrinsics, gain, floor) for seed in seeds
     ]
+    count = FAMILIES[family].cells
     scale = 1.0
     if judge.own_noise:
         noise = [fit.chi2_per_dof for fit in fits if fit.converged]
@@ -108,13 +110,13 @@ def measure(
                 tag_id=seed.tag_id,
                 corners_px=fit.corners_px,
                 covariance_px2=fit.covariance_px2 + floor_px**2 * np.eye(8),
-                rejected=_reason(fit, judge, picture, full_scale, float(edges.min()) / CELLS, shift, incidence),
+                rejected=_reason(fit, judge, picture, full_scale, float(edges.min()) / count, shift, incidence),
                 chi2_per_dof=fit.chi2_per_dof,
                 pixels=fit.pixels,
                 sigma_px=fit.sigma_px,
                 black=fit.black,
                 white=fit.white,
-                cell_px=float(edges.min()) / CELLS,
+                cell_px=float(edges.min()) / count,
                 incidence=incidence,
                 seed_shift_px=shift,
             )

@@ -159,10 +159,10 @@ def cover(
     Args:
         grid_x, grid_y: (r, c) undistorted pixel coordinates of the sub-pixel centres.
         tag_from_px: (3, 3) homography to cell coordinates.
-        cells: (8, 8) of the tag, 1 white.  h: side of a sub-pixel, ideal px.
+        cells: (n, n) of the tag, 1 white.  h: side of a sub-pixel, ideal px.
     """
     rows, columns = grid_x.shape
-    m = tag_from_px
+    m, n = tag_from_px, len(cells)
     share_u, share_v = np.empty(6), np.empty(6)
     clear_u, clear_v = _widest(grid_x, grid_y, m, 0, h), _widest(grid_x, grid_y, m, 1, h)
     for r in range(rows):
@@ -173,8 +173,8 @@ def cover(
             v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) * w
             column, row = int(np.floor(u)), int(np.floor(v))
             if clear_u < u - column < 1.0 - clear_u and clear_v < v - row < 1.0 - clear_v:
-                beyond = row < -1 or row > 8 or column < -1 or column > 8
-                quiet = row == -1 or row == 8 or column == -1 or column == 8
+                beyond = row < -1 or row > n or column < -1 or column > n
+                quiet = row == -1 or row == n or column == -1 or column == n
                 layers[1, r, c] = 1.0 if beyond else 0.0
                 layers[0, r, c] = 0.0 if beyond else (1.0 if quiet else float(cells[row, column]))
                 continue
@@ -191,9 +191,9 @@ def cover(
                 for i in range(count_u):
                     column = first_u + i
                     share = share_u[i] * share_v[j]
-                    if row < -1 or row > 8 or column < -1 or column > 8:
+                    if row < -1 or row > n or column < -1 or column > n:
                         outside += share
-                    elif row == -1 or row == 8 or column == -1 or column == 8 or cells[row, column] == 1:
+                    elif row == -1 or row == n or column == -1 or column == n or cells[row, column] == 1:
                         white += share
             if count_u > 1 and count_v > 1:
                 # u and v vary together in a sub-pixel that the tag's tilt shears: E = uv-covariance x both densities.
@@ -209,9 +209,9 @@ def cover(
                         for k in range(4):
                             column, row = first_u + i + (k & 1), first_v + j + (k >> 1)
                             sign = 1.0 if k == 0 or k == 3 else -1.0
-                            if row < -1 or row > 8 or column < -1 or column > 8:
+                            if row < -1 or row > n or column < -1 or column > n:
                                 outside += sign * extra
-                            elif row == -1 or row == 8 or column == -1 or column == 8 or cells[row, column] == 1:
+                            elif row == -1 or row == n or column == -1 or column == n or cells[row, column] == 1:
                                 white += sign * extra
             layers[0, r, c] = white
             layers[1, r, c] = outside

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from netdesign.imaging.geometry import FACE_STEP_PX, distorted_vertices, divided, face_levels, part_triangles, tag_quads
 from netdesign.imaging.looks import Appearance
 from netdesign.imaging.optics import Picture, decimate
-from netdesign.imaging.tags import CELLS, QUIET_CELLS, cells
+from netdesign.imaging.tags import QUIET_CELLS, cells
 from netdesign.model.arrays import Floats
 from netdesign.model.camera import Camera
 from netdesign.model.compiled import entry, part
@@ -129,7 +129,7 @@ class ReferenceRenderer:
 
     def _draw_tag(self, tag: int, cam_from_world: Floats, light: Picture, inverse_depth: Picture) -> None:
         targets, look = self.scene.targets, self.appearance
-        outer = self._outline(tag, -QUIET_CELLS, -QUIET_CELLS, CELLS + 2 * QUIET_CELLS, cam_from_world)
+        outer = self._outline(tag, -QUIET_CELLS, -QUIET_CELLS, targets.cells + 2 * QUIET_CELLS, cam_from_world)
         low = np.maximum(np.floor(outer[:, :2].min(axis=0)).astype(int) - 1, 0)
         high = np.minimum(np.ceil(outer[:, :2].max(axis=0)).astype(int) + 2, light.shape[::-1])
         if (high - low < 3).any():
@@ -137,7 +137,7 @@ class ReferenceRenderer:
         size = (high - low)[::-1]
         whole, dark = np.zeros(size), np.zeros(size)
         _add_outline(whole, outer[:, :2] - low, 1.0)
-        _add_outline(dark, self._outline(tag, 0, 0, CELLS, cam_from_world)[:, :2] - low, 1.0)
+        _add_outline(dark, self._outline(tag, 0, 0, targets.cells, cam_from_world)[:, :2] - low, 1.0)
         for row, column in np.argwhere(cells(targets.family, int(targets.ids[tag])) == 1):
             _add_outline(dark, self._outline(tag, column, row, 1, cam_from_world)[:, :2] - low, -1.0)
         # The orientation of the outlines in the picture decides the sign of all areas alike.
@@ -156,16 +156,16 @@ class ReferenceRenderer:
         """Return (k, 3) sub-pixel x, y and 1/depth along the square of ``width`` cells at cell coordinates (u, v)."""
         targets, camera = self.scene.targets, self.camera
         distance = float(np.linalg.norm(transform(cam_from_world, targets.centres[tag])))
-        length_px = width * targets.size_m / CELLS * float(camera.focal_px.max()) / distance
+        length_px = width * targets.size_m / targets.cells * float(camera.focal_px.max()) / distance
         steps = int(np.ceil(length_px / EDGE_STEP_PX)) if camera.distortion.any() else 1
         along = np.arange(max(steps, 1)) / max(steps, 1) * width
         zero, full = np.zeros_like(along), np.full_like(along, width)
         across = u + np.concatenate([along, full, width - along, zero])
         down = v + np.concatenate([zero, along, full, width - along])
-        step = targets.size_m / CELLS
+        step = targets.size_m / targets.cells
         up = np.cross(targets.normals[tag], targets.x_axes[tag])
         points = targets.centres[tag] + step * (
-            (across[:, None] - CELLS / 2) * targets.x_axes[tag] - (down[:, None] - CELLS / 2) * up
+            (across[:, None] - targets.cells / 2) * targets.x_axes[tag] - (down[:, None] - targets.cells / 2) * up
         )
         bent = distorted_vertices(transform(cam_from_world, points), camera.distortion)
         return np.concatenate([self._subpixels(bent), 1 / bent[:, 2:]], axis=1)

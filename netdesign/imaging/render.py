@@ -24,7 +24,7 @@ from netdesign.errors import EnvironmentProblem, InputError
 from netdesign.imaging.geometry import FACE_STEP_PX, TagQuad, divided, face_levels, part_triangles, tag_quads
 from netdesign.imaging.looks import Appearance
 from netdesign.imaging.optics import Picture, decimate, margin_px
-from netdesign.imaging.tags import CELLS, QUIET_CELLS, texture
+from netdesign.imaging.tags import QUIET_CELLS, texture
 from netdesign.model.arrays import Floats, Ints
 from netdesign.model.camera import Camera
 from netdesign.model.frames import transform
@@ -37,7 +37,7 @@ SHADERS = Path(__file__).parent / "shaders"
 # The shader's smoothing beyond a supersample's own width, supersamples squared: 1/12 of 1 for an edge along the grid,
 # of 0.7 on average for one that leans.
 SMOOTHED = 0.8 / 12
-PADDING = 1  # texels around the quiet zone: rows of 12 bytes, OpenGL wants a multiple of 4
+PADDING = 1  # cells of white around the quiet zone: the texture's edge is not to show
 
 
 def probe() -> str:
@@ -106,7 +106,8 @@ class Renderer:
         quads = tag_quads(self.scene.targets, self.camera, cam_from_world)
         drawn = [
             primitive(
-                positions=_gl(quad.vertices), texcoord_0=_texture_places(quad), indices=quad.faces,
+                positions=_gl(quad.vertices), indices=quad.faces,
+                texcoord_0=_texture_places(quad, self.scene.targets.cells),
                 material=material(baseColorTexture=self._texture(quad), baseColorFactor=[1.0, 1.0, 1.0, 1.0]),
             )
             for quad in quads
@@ -144,9 +145,9 @@ class Renderer:
         return self._textures[quad.tag]
 
 
-def _texture_places(quad: TagQuad) -> NDArray[np.float32]:
+def _texture_places(quad: TagQuad, cells: int) -> NDArray[np.float32]:
     """Return where the vertices lie on the texture, which has PADDING around the quiet zone."""
-    side = CELLS + 2 * QUIET_CELLS
+    side = cells + 2 * QUIET_CELLS
     return np.asarray((quad.uv * side + PADDING) / (side + 2 * PADDING), np.float32)
 
 

@@ -12,10 +12,13 @@ class CornerNoise:
     """The calibrated noise of a tag corner: ``k`` and ``floor_px`` of the closed form in photogrammetry/precision.
 
     sigma² = (k · (sigma_n/dI) · s^0.537 · L^-0.506 · cos(i)^-0.400 · exp(1.03 (s/c)² + 0.68 (s/c')²))² + floor².
+
+    k is that of a family of tags; ``cells`` along its edge L make the cells c and, across the tilt axis, c'.
     """
 
     k: float
     floor_px: float
+    cells: int = 8
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,7 @@
 """The part, the AprilTags on it, and the two together."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,6 +31,21 @@ class Part:
         return self.vertices[self.faces]
 
 
+class TagFamily(NamedTuple):
+    """A family of AprilTags: cells along the black square, its border of one cell included, and how many ids."""
+
+    cells: int
+    ids: int
+
+
+FAMILIES = {
+    "tag16h5": TagFamily(cells=6, ids=30),
+    "tag25h9": TagFamily(cells=7, ids=35),
+    "tag36h10": TagFamily(cells=8, ids=2320),
+    "tag36h11": TagFamily(cells=8, ids=587),
+}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Targets:
     """AprilTags in the world frame; their corners are the object points.
@@ -39,7 +55,7 @@ class Targets:
 
     Attributes:
         ids: (g,) tag ids.  centres: (g, 3) m.  normals, x_axes: (g, 3) unit, orthogonal.
-        size_m: edge of the black square.  family: "tag36h11".
+        size_m: edge of the black square.  family: one of ``FAMILIES``.
     """
 
     ids: Ints
@@ -59,6 +75,11 @@ class Targets:
         """Return the tags chosen by ``rows`` (g,)."""
         kept = {name: getattr(self, name)[rows] for name in ("ids", "centres", "normals", "x_axes")}
         return replace(self, **kept)
+
+    @property
+    def cells(self) -> int:
+        """Cells along the black square."""
+        return FAMILIES[self.family].cells
 
     @property
     def points(self) -> Floats:

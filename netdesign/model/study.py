@@ -34,7 +34,7 @@ class PartTable(Table):
 class TargetsTable(Table):
     """[targets]: AprilTags, in the mesh frame; from a file, or spread over the faces."""
 
-    family: Literal["tag36h11"] = "tag36h11"
+    family: Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"] = Field("tag36h11", description="of AprilTags")
     size_mm: Positive = Field(description="edge of the black square")
     file: str | None = Field(None, description="CSV: tag,x_mm,y_mm,z_mm,nx,ny,nz,ux,uy,uz")
     spacing_mm: Positive | None = Field(None, description="instead of file: grid spacing of tags on every large face")

@@ -31,7 +31,6 @@ from netdesign.model.scene import Targets
 GREY_STEP = 215.0  # black to white of a printed tag in an 8-bit image
 EDGE_LEVEL = 90.0  # the level whose noise stands for an edge: below the middle, where the dark side weighs more
 ELONGATION = 1.6  # ratio of a corner's largest to its smallest variance, face-on
-CELLS = 8.0  # data cells and black border along an edge of tag36h11
 
 
 def grey_noise(camera: Camera) -> float:
@@ -74,7 +73,7 @@ def _noise(camera: Camera, edge_px: Floats | float, incidence: Floats | float) -
     # Beyond 89.9° and below a hundredth of a pixel nothing is measured: keep the numbers finite there.
     cosine = np.maximum(np.cos(incidence), 1e-3)
     edge = np.maximum(np.asarray(edge_px, dtype=np.float64), 1e-2)
-    loss = (blur / edge * CELLS) ** 2 * (1.03 + 0.68 / cosine**2)
+    loss = (blur / edge * noise.cells) ** 2 * (1.03 + 0.68 / cosine**2)
     sharpness = blur**0.537 * edge**-0.506 * cosine**-0.400 * np.exp(np.minimum(loss, 100.0))
     return np.asarray(noise.k * (grey_noise(camera) / GREY_STEP) * sharpness)
 

@@ -23,7 +23,7 @@ from validation.imaging.scenes import CAMERA, LIMITS, compare, polyhedron, stati
 
 def pipeline():
     """The whole chain on the polyhedron, random views, default noise."""
-    scene, floor = polyhedron(), read_corner_noise(None).floor_px
+    scene, floor = polyhedron(), read_corner_noise(None, "tag36h11").floor_px
     poses = stations(14, 21, 0.45, 0.75)
     visible = sightings(scene, CAMERA, poses, LIMITS).visible_tags
     photographer = Photographer(scene, CAMERA, Shoot(seed=4, supersample=4))
@@ -120,7 +120,7 @@ def false_ids():
 
 def prediction():
     """Measured corner sigma over the closed form's with the shipped k and floor, for other blurs and sensors."""
-    shipped, rows = read_corner_noise(None), []
+    shipped, rows = read_corner_noise(None, "tag36h11"), []
     with worker_pool(2) as executor:
         for blur, well in ((0.5, 1500.0), (1.0, 1500.0), (1.3, 1500.0), (0.7, 600.0), (0.7, 6000.0)):
             camera = replace(CAMERA, blur_px=blur, full_well_e=well)

@@ -117,9 +117,10 @@ def mismatch():
     rows = []
     outward = truth - truth.mean(axis=1, keepdims=True)
     outward /= np.linalg.norm(outward, axis=2, keepdims=True)
+    floor = read_corner_noise(None, "tag36h11").floor_px
     for name, (picture, known) in cases.items():
         for gates in (Gates(), Gates(own_noise=True)):
-            tags = measure(picture, known, "tag36h11", 0.02, range(count), gates, read_corner_noise(None).floor_px)
+            tags = measure(picture, known, "tag36h11", 0.02, range(count), gates, floor)
             good = [tag for tag in tags if not tag.rejected]
             error = np.reshape([tag.corners_px - truth[tag.tag_id] for tag in good], (-1, 4, 2))
             radial = [np.einsum("cx,cx->c", tag.corners_px - truth[tag.tag_id], outward[tag.tag_id]) for tag in good]

@@ -90,6 +90,8 @@ def _record(
     part, targets = task.scene.part, task.scene.targets
     placed = len(targets.ids) + len(task.left_out)
     near, far = task.camera.depth_of_field()
+    table, optics = task.study.camera, ("pixel_um", "f_number", "focus_mm")
+    any_optics = table.f_number is not None or table.focus_mm is not None
     return {
         "study": task.study.name,
         "place": "sphere" if task.sphere.depth is None else "admissible stations",
@@ -105,6 +107,7 @@ def _record(
         "corner_px": image_radius_px(task.camera),
         "noise": task.study.camera.noise,
         "sigma_px": None if task.camera.corner_noise else task.camera.sigma_px,
+        "optics_missing": [name for name in optics if getattr(table, name) is None] if any_optics else [],
         "depth_of_field_mm": [near * 1e3, far * 1e3],
         "sightings": seen.refusals,
         "seen_share": {str(tag): float(share) for tag, share in zip(seen.tag_ids, seen.share, strict=True)},
@@ -145,6 +148,8 @@ def _text(record: dict[str, Any]) -> str:
         else f"noise      {record['sigma_px']:g} px per image coordinate"
     )
     near, far = record["depth_of_field_mm"]
+    if record["optics_missing"]:
+        lines.append(f"sharp      everywhere: for a depth of field {', '.join(record['optics_missing'])} is missing")
     if np.isfinite(far) or near > 0:
         lines.append(f"sharp      {near:.0f} mm to {far:.0f} mm along the optical axis")
     if record["fold_px"] < record["corner_px"]:

@@ -253,3 +253,29 @@ def test_check_says_of_stations_that_they_are_no_sphere(study):
     shells = check_study(study("radius_mm = 600", "radius_mm = [550, 650]")).text
     assert "tested over the admissible stations" in shells
     assert "sphere" not in shells
+
+
+def test_a_value_of_several_kinds_is_one_problem(study):
+    with pytest.raises(InputError, match=r"viewpoints\.roll_deg: expected a valid number or 'free', found 'any'$"):
+        load_task(study("radius_mm = 600", 'radius_mm = 600\nroll_deg = "any"'))
+
+
+def test_a_noise_file_that_would_not_be_used_is_refused(study):
+    with pytest.raises(InputError, match='noise_file: expected noise = "detector" beside it'):
+        load_task(study("[camera]", '[camera]\nnoise_file = "noise.json"'))
+
+
+def test_check_says_what_a_depth_of_field_lacks(study):
+    assert "sharp" not in check_study(study()).text
+    text = check_study(study("[camera]", "[camera]\npixel_um = 3.45\nf_number = 8")).text
+    assert "sharp      everywhere: for a depth of field focus_mm is missing" in text
+
+
+def test_a_distance_to_a_tag_that_is_left_out_says_so(study):
+    path = study("spacing_mm = 45", "spacing_mm = 45\nmin_seen_share = 0.01")
+    gone = load_task(path).left_out[0]
+    path.write_text(
+        path.read_text() + f'[requirements]\ndistances = [{{ from = "{gone}.0", to = "0.1", u95_um = 9 }}]\n'
+    )
+    with pytest.raises(InputError, match=rf"found '{gone}\.0', a tag that targets\.min_seen_share leaves out"):
+        check_study(path)

@@ -11,6 +11,9 @@ from pydantic import BaseModel, ValidationError
 from netdesign.errors import InputError
 from netdesign.model.study import Study
 
+# What pydantic appends to the place of a value that may be one of several kinds.
+KINDS = ("float", "int", "str", "literal['free']")
+
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file.
@@ -50,6 +53,12 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     """Return the first problem in words; an unknown key before the missing one that it was meant for."""
     problems = sorted(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
     problem = problems[0]
+    # A value of several kinds fails as each of them: one problem, named by its key and not by a kind.
+    if problem["loc"][:-1] and problem["loc"][-1] in KINDS:
+        same = [other for other in problems if other["loc"][:-1] == problem["loc"][:-1]]
+        wanted = " or ".join(other["msg"].removeprefix("Input should be ").partition(",")[0] for other in same)
+        problem = {**problem, "type": "kinds", "loc": problem["loc"][:-1], "msg": wanted, "ctx": {}}
+        problems = [problem, *(other for other in problems if other not in same)]
     place = ".".join(str(part) for part in problem["loc"] if part not in ("single", "pair"))
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     if problem["type"] == "extra_forbidden":

@@ -70,6 +70,12 @@ class CameraTable(Table):
     full_well_e: Positive = Field(1500, description="electrons at white")
     read_noise_e: NotNegative = 8
 
+    @model_validator(mode="after")
+    def _noise_file_is_used(self) -> "CameraTable":
+        if self.noise_file is not None and self.noise != "detector":
+            raise ValueError('noise_file: expected noise = "detector" beside it, found noise = "constant"')
+        return self
+
 
 def _single_or_pair(value: object) -> str:
     return "pair" if isinstance(value, (list, tuple)) and len(value) == 2 else "single"

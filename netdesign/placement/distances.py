@@ -60,7 +60,9 @@ def named_ends(task: Task) -> Ints:
     for item in task.study.requirements.distances:
         for name in (item.from_, item.to):
             if name not in ids:
-                raise InputError(f"requirements.distances: expected tag.corner of the part, found {name!r}")
+                left_out = name.partition(".")[0] in map(str, task.left_out)
+                why = ", a tag that targets.min_seen_share leaves out" if left_out else ""
+                raise InputError(f"requirements.distances: expected tag.corner of the part, found {name!r}{why}")
         if item.from_ == item.to:
             raise InputError(f"requirements.distances: expected two object points, found {item.from_!r} twice")
         ends.append((ids[item.from_], ids[item.to]))

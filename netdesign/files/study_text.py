@@ -57,8 +57,10 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     if problem["loc"][:-1] and problem["loc"][-1] in KINDS:
         same = [other for other in problems if other["loc"][:-1] == problem["loc"][:-1]]
         wanted = " or ".join(other["msg"].removeprefix("Input should be ").partition(",")[0] for other in same)
-        problem = {**problem, "type": "kinds", "loc": problem["loc"][:-1], "msg": wanted, "ctx": {}}
-        problems = [problem, *(other for other in problems if other not in same)]
+        others = [other for other in problems if other not in same]
+        where = ".".join(str(part) for part in problem["loc"][:-1])
+        more = f" (and {len(others)} more)" if others else ""
+        return f"{where}: expected {wanted}, found {problem['input']!r}{more}"
     place = ".".join(str(part) for part in problem["loc"] if part not in ("single", "pair"))
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     if problem["type"] == "extra_forbidden":

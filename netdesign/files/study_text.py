@@ -56,11 +56,11 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     # A value of several kinds fails as each of them: one problem, named by its key and not by a kind.
     if problem["loc"][:-1] and problem["loc"][-1] in KINDS:
         same = [other for other in problems if other["loc"][:-1] == problem["loc"][:-1]]
-        wanted = " or ".join(other["msg"].removeprefix("Input should be ").partition(",")[0] for other in same)
+        kinds = " or ".join(other["msg"].removeprefix("Input should be ").partition(",")[0] for other in same)
         others = [other for other in problems if other not in same]
         where = ".".join(str(part) for part in problem["loc"][:-1])
         more = f" (and {len(others)} more)" if others else ""
-        return f"{where}: expected {wanted}, found {problem['input']!r}{more}"
+        return f"{where}: expected {kinds}, found {problem['input']!r}{more}"
     place = ".".join(str(part) for part in problem["loc"] if part not in ("single", "pair"))
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     if problem["type"] == "extra_forbidden":

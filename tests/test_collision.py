@@ -17,7 +17,6 @@ from netdesign.motion.collision import (
     PART,
     SELF,
     SIGHT,
-    SKIP,
     TOUCH,
     part_field,
     states,
@@ -136,6 +135,24 @@ def test_a_tower_beside_the_base_is_an_obstacle_for_every_link(margin, tower_x):
     assert touched > 20
 
 
+def test_the_first_link_is_as_free_as_its_mesh():
+    """The capsule of a UR10's shoulder is a ball that touches this tower at every angle: nothing could be reached."""
+    tower = replace(
+        cell(),
+        obstacle_centres=[[0, 0, -0.11], [-0.75, 0, 0.128]],
+        obstacle_sizes=[[0.9, 0.9, 0.02], [0.08, 0.6, 0.26]],
+    )
+    loaded = load_arm(tower, sphere(), BOX)
+    q = restarts(loaded.placed, 300, seed=6)
+    free = states(loaded.body, q) == FREE
+    assert free.sum() > 20
+    q[:, 1:] = [-1.57, 0.5, -1.0, 0.5, 0.0]  # the rest of the arm upright
+    alone = [not loaded.meshes.contact(joints) for joints in q]
+    told = states(loaded.body, q) != OBSTACLE
+    assert not (told & ~np.array(alone)).any()
+    assert 0 < told.sum() < len(q)
+
+
 def _bvh(shape):
     mesh = coal.BVHModelOBBRSS()
     mesh.beginModel(len(shape.faces), len(shape.vertices))
@@ -148,7 +165,8 @@ def _bvh(shape):
 def test_what_the_base_stands_on_is_no_obstacle_for_the_links_above_it():
     wide = replace(cell(), margin=0.1)
     loaded = load_arm(wide, sphere(), BOX)
-    assert (loaded.meshes.mounting[1] == [SKIP, TOUCH]).all()  # the pedestal
+    assert loaded.meshes.mounting[1] == TOUCH  # the pedestal
+    assert (loaded.body.turn == FREE).all()
     assert (states(loaded.body, restarts(loaded.placed, 300, seed=5)) == FREE).any()
 
 

@@ -1,6 +1,5 @@
 """The robot cell ready for the kernels: chain, capsules, pairs to test, part and obstacles in one value."""
 
-import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +19,7 @@ from netdesign.motion.stored import Arrays, content_key, stored
 from netdesign.motion.ur_kinematics import UrArm, ur_arm
 
 _SIGHT_BALLS = 8
-_VERSION = 4
+_VERSION = 5
 _SAMPLES = 300
 _NEARLY_ALWAYS = 0.8
 
@@ -101,6 +100,7 @@ def load_arm(cell: RobotCell, sphere: ViewingSphere, part: Part) -> ArmCell:
         capsule_link=np.array(meshes.links, dtype=np.int64)[owner],
         camera_parts=len(camera),
         pairs=_capsule_pairs(meshes.pairs, owner),
+        turn=meshes.first_turn(),
         boxes=boxes,
         mounting=meshes.mounting,
         field=field,
@@ -136,7 +136,7 @@ def _without_false_alarms(body: Body, meshes: MeshCell, placed: Chain) -> tuple[
     """Return the body without the capsule pairs that overlap in nearly every configuration that is free in truth.
 
     (The hub of a UR5's upper arm and its base, say: near by construction, and capsules are rounder than links.)
-    Likewise of links 1 and 2 and what the base stands on.
+    Likewise of link 2 and what is near the base.
     """
 
     def build() -> Arrays:
@@ -147,11 +147,11 @@ def _without_false_alarms(body: Body, meshes: MeshCell, placed: Chain) -> tuple[
 
     keep = stored(content_key("false alarms", _VERSION, body.capsules, body.pairs, body.placements), build)["keep"]
     mounting, starts = body.mounting.copy(), restarts(placed, _SAMPLES, seed=2)
-    for box, link in itertools.product(meshes.beneath.tolist(), (1, 2)):
+    for box in meshes.beneath.tolist():
         # Where the capsules are too near at every angle and the meshes are not, these have to say when they are.
         for easier in (TOUCH, SKIP):
-            if near_box(body._replace(mounting=mounting), box, link, starts).all():
-                mounting[box, link - 1] = easier
+            if near_box(body._replace(mounting=mounting), box, starts).all():
+                mounting[box] = easier
     loose = not keep.all() or bool((mounting != body.mounting).any())
     return body._replace(pairs=np.ascontiguousarray(body.pairs[keep]), mounting=mounting), loose
 

@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from netdesign.model.arrays import Bools, Floats, Ints
@@ -29,6 +30,7 @@ REASONS = (
     "the robot blocks the view",
 )
 KEEP, TOUCH, SKIP = range(3)
+TURN_STEPS = 360
 _FIELD_CELLS = 96
 _FIELD_PAD = 0.10
 _SHORTEST_STEP = 5e-4
@@ -42,10 +44,11 @@ class Body(NamedTuple):
     placements (r, 4, 4) and last_from_cam (4, 4): the chain from the world to the camera.
     capsules (c, 7) in the frame of capsule_link (c,), 0 the base: both ends and the radius; the last `camera_parts` of
     them belong to the camera. pairs (s, 2): capsules that are tested against each other.
-    boxes (b, 6): centre and half edge lengths; mounting (b, 2): whether links 1 and 2 KEEP the margin to them, are only
-    tested for TOUCH, because the base stands on it and they are near it at every angle, or SKIP it, because they never
-    touch it. field (x, y, z): lower bound of the distance to the part at the centre of each cell; field_origin (3,):
-    centre of cell 0; field_step: edge of a cell.
+    turn (TURN_STEPS,): state of link 1, which no capsules are asked for, over one turn of its joint from 0.
+    boxes (b, 6): centre and half edge lengths; mounting (b,): whether link 2 must KEEP the margin to them, is only
+    tested for TOUCH, because the base stands on it and it is near at every angle, or SKIPs it: the meshes have to say.
+    field (x, y, z): lower bound of the distance to the part at the centre of each cell; field_origin (3,): centre of
+    cell 0; field_step: edge of a cell.
     margin: kept from part and obstacles. sight (k, 2): share of the line of sight, as long as the centre is far, and
     the radius that must be clear there, never more than half of the way; centre (3,) of the stations.
     """
@@ -56,6 +59,7 @@ class Body(NamedTuple):
     capsule_link: Ints
     camera_parts: int
     pairs: Ints
+    turn: NDArray[np.int8]
     boxes: Floats
     mounting: Ints
     field: Floats
@@ -200,15 +204,19 @@ def configuration_state(body, q, links, placed):  # type: ignore[no-untyped-def]
     links (r, 3, 4) and placed (c, 6) are scratch: world_from_link and the capsules' ends in the world.
     """
     r, count = q.shape[0], body.capsules.shape[0]
+    step = math.floor(q[0] * (TURN_STEPS / (2.0 * math.pi)))
+    for at in range(step, step + 2):
+        if body.turn[at % TURN_STEPS] != FREE:
+            return body.turn[at % TURN_STEPS]
     _place(body, q, links, placed)
     for c in range(count):
-        if body.capsule_link[c] == 0:
+        if body.capsule_link[c] <= 1:
             continue
         radius = body.capsules[c, 6] + body.margin
         if touches_field(placed[c], radius, body.field, body.field_origin, body.field_step):
             return PART
         for b in range(body.boxes.shape[0]):
-            way = body.mounting[b, body.capsule_link[c] - 1] if body.capsule_link[c] <= 2 else KEEP
+            way = body.mounting[b] if body.capsule_link[c] == 2 else KEEP
             if way == SKIP:
                 continue
             near = radius if way == KEEP else body.capsules[c, 6]
@@ -248,29 +256,29 @@ def states(body, joints):  # type: ignore[no-untyped-def]
     return out
 
 
-def _alone(body: Body) -> Body:
+def alone(body: Body) -> Body:
     """Return the body with nothing around it and nothing to look at."""
     return body._replace(
-        boxes=body.boxes[:0], mounting=body.mounting[:0], sight=body.sight[:0],
+        turn=np.zeros_like(body.turn), boxes=body.boxes[:0], mounting=body.mounting[:0], sight=body.sight[:0],
         field=np.full((2, 2, 2), np.inf), field_origin=np.full(3, -_NOWHERE), field_step=2.0 * _NOWHERE,
     )  # fmt: skip
 
 
-def near_box(body: Body, box: int, link: int, joints: Floats) -> Bools:
-    """Return in which of joints (n, r) the capsules of link 1 or 2 come too near to a box, see ``Body.mounting``."""
-    own = body.capsule_link == link
-    alone = _alone(body)._replace(
+def near_box(body: Body, box: int, joints: Floats) -> Bools:
+    """Return in which of joints (n, r) the capsules of link 2 come too near to a box, see ``Body.mounting``."""
+    own = body.capsule_link == 2
+    by_itself = alone(body)._replace(
         capsules=np.ascontiguousarray(body.capsules[own]), capsule_link=body.capsule_link[own], camera_parts=0,
         pairs=body.pairs[:0], boxes=body.boxes[box : box + 1], mounting=body.mounting[box : box + 1],
     )  # fmt: skip
-    return np.asarray(states(alone, joints) == OBSTACLE)
+    return np.asarray(states(by_itself, joints) == OBSTACLE)
 
 
 def overlapping(body: Body, joints: Floats) -> Ints:
     """Return in how many of joints (n, r) each of the body's pairs (s,) overlaps."""
-    alone = _alone(body)
+    by_itself = alone(body)
     pairs = (body.pairs[s : s + 1] for s in range(len(body.pairs)))
-    return np.array([(states(alone._replace(pairs=pair), joints) == SELF).sum() for pair in pairs], dtype=np.int64)
+    return np.array([(states(by_itself._replace(pairs=pair), joints) == SELF).sum() for pair in pairs], dtype=np.int64)
 
 
 def leg_state(body: Body, start: Floats, end: Floats, step: float) -> int:

@@ -9,13 +9,15 @@ from dataclasses import dataclass
 
 import coal
 import numpy as np
+from numpy.typing import NDArray
 
 from netdesign.errors import InputError
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.frames import pose
 from netdesign.model.scene import Part
 from netdesign.model.task import RobotCell
-from netdesign.motion.collision import KEEP, SKIP, TOUCH
+from netdesign.motion.collision import FREE, KEEP, OBSTACLE, TOUCH, TURN_STEPS
+from netdesign.motion.collision import PART as STATE_PART
 from netdesign.motion.kinematics import link_poses, restarts
 from netdesign.motion.robot import Chain
 from netdesign.motion.stored import Arrays, content_key, stored
@@ -24,6 +26,7 @@ _SAMPLES = 3000
 _NEARLY_ALWAYS = 0.95
 _BRACKET_RADIUS = 0.02
 _ANGLES = (181, 31)  # of the first two joints, over which it is found out what the base stands on
+_SPARE = 2e-3  # m: link 1 moves less between two steps of its turn
 PART = "the part"
 
 
@@ -104,7 +107,8 @@ class MeshCell:
             or any(_encloses(part, shape.vertices[0]) for shape in chain.shapes if shape.link == 0)
         ):
             raise InputError(
-                "robot.base_position_mm: expected a base outside of the part, found one that reaches into it"
+                "robot.base_position_mm: expected a base outside of the part (mm, world frame), found one that reaches"
+                " into it"
             )
         last = np.minimum(chain.upper[:2], chain.lower[:2] + 2.0 * np.pi)
         first, second = (np.linspace(chain.lower[joint], last[joint], _ANGLES[joint]) for joint in (0, 1))
@@ -125,9 +129,27 @@ class MeshCell:
                 far = not self._hits(2, item, self._near)
                 if far:
                     break
-            turns_away = any(near) and not all(near)
-            ways[name] = (KEEP if turns_away else TOUCH if any(touching) else SKIP, KEEP if far else TOUCH)
+            ways[name] = (TOUCH if all(near) else KEEP, KEEP if far else TOUCH)
         return ways
+
+    def first_turn(self) -> NDArray[np.int8]:
+        """Return what link 1 touches (_TURN_STEPS,) as its joint turns: FREE, PART or OBSTACLE, 2 mm to spare.
+
+        No other joint moves it, and its shape often is nothing like a capsule.
+        """
+        spare = {}
+        for way, request in ((KEEP, self._near), (TOUCH, self._touch)):
+            spare[way] = coal.CollisionRequest(coal.CollisionRequestFlag.NO_REQUEST, 1)
+            spare[way].security_margin = request.security_margin + _SPARE
+        q, turn = np.zeros(len(self._links)), np.full(TURN_STEPS, FREE, dtype=np.int8)
+        for step in range(TURN_STEPS):
+            q[0] = 2.0 * np.pi * step / TURN_STEPS
+            self.place(q)
+            for name, item in self._around:
+                if self._hits(1, item, spare[self._mounting.get(name, (KEEP, KEEP))[0]]):
+                    turn[step] = STATE_PART if name == PART else OBSTACLE
+                    break
+        return turn
 
     def _hits(self, link: int, item: coal.CollisionObject, request: coal.CollisionRequest) -> bool:
         """Return whether a solid of a link touches or comes near an object."""
@@ -175,9 +197,9 @@ class MeshCell:
 
     @property
     def mounting(self) -> Ints:
-        """(b, 2) how links 1 and 2 are tested against every obstacle, see ``Body``."""
-        ways = [self._mounting.get(name, (KEEP, KEEP)) for name, _ in self._around if name != PART]
-        return np.array(ways, dtype=np.int64).reshape(-1, 2)
+        """(b,) how link 2 is tested against every obstacle, see ``Body``."""
+        ways = [self._mounting.get(name, (KEEP, KEEP))[1] for name, _ in self._around if name != PART]
+        return np.array(ways, dtype=np.int64)
 
     @property
     def beneath(self) -> Ints:

@@ -8,7 +8,7 @@ import numpy as np
 
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.motion.cell import ArmCell
-from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION, REASONS, states
+from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION, REASONS, alone, states
 from netdesign.motion.inverse import rest_of, solve_closed, tested
 from netdesign.motion.joint_lookup import LANES
 from netdesign.motion.joint_map import JointMap
@@ -71,9 +71,7 @@ def exact_options(joint_map: JointMap, viewpoints: Floats, given: Floats = NO_PO
 
 def _free_on_meshes(arm: ArmCell, joints: Floats) -> Bools:
     """Return which of joints (k, r) are free on the real meshes, the line of sight still by capsules."""
-    # A margin of -100 m and no pairs leave nothing but the line of sight to be tested.
-    sight_only = arm.body._replace(pairs=np.zeros((0, 2), dtype=np.int64), margin=-100.0)
-    sees = states(sight_only, joints) == FREE
+    sees = states(alone(arm.body)._replace(pairs=arm.body.pairs[:0], sight=arm.body.sight), joints) == FREE
     return np.array([clear and not arm.meshes.contact(q) for clear, q in zip(sees.tolist(), joints, strict=True)])
 
 

@@ -73,6 +73,32 @@ def project(world_from_cam: Floats, points: Floats, intrinsics: Floats) -> tuple
         return intrinsics[..., :2] * distorted + intrinsics[..., 2:4], q[..., 2]
 
 
+def point_jacobians(world_from_cam: Floats, points: Floats, intrinsics: Floats) -> Floats:
+    """Return d_xy_d_point (…, 2, 3) alone; arguments as for ``project``."""
+    q = in_camera(world_from_cam, points)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return _d_xy_d_q(q, q[..., 0] / q[..., 2], q[..., 1] / q[..., 2], intrinsics) @ _transposed(world_from_cam)
+
+
+def _d_xy_d_q(q: Floats, x: Floats, y: Floats, intrinsics: Floats) -> Floats:
+    """(…, 2, 3) derivatives with respect to the point in the camera frame, by way of the normalised (x, y)."""
+    fx, fy, _, _, k1, k2, p1, p2 = (intrinsics[..., index] for index in range(8))
+    inverse_depth, r2 = 1.0 / q[..., 2], x * x + y * y
+    radial, slope = 1.0 + r2 * (k1 + k2 * r2), 2.0 * (k1 + 2.0 * k2 * r2)
+    mixed = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    ux, uy = fx * (radial + x * x * slope + 2 * p1 * y + 6 * p2 * x), fx * mixed
+    vx, vy = fy * mixed, fy * (radial + y * y * slope + 6 * p1 * y + 2 * p2 * x)
+    rows = (
+        (ux * inverse_depth, uy * inverse_depth, -(ux * x + uy * y) * inverse_depth),
+        (vx * inverse_depth, vy * inverse_depth, -(vx * x + vy * y) * inverse_depth),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _transposed(world_from_cam: Floats) -> Floats:
+    return np.swapaxes(world_from_cam[..., :3, :3], -1, -2)
+
+
 def project_with_jacobians(world_from_cam: Floats, points: Floats, intrinsics: Floats) -> Projection:
     """Return image points with analytic derivatives; arguments as for ``project``."""
     world_from_cam = np.asarray(world_from_cam, dtype=np.float64)
@@ -80,22 +106,12 @@ def project_with_jacobians(world_from_cam: Floats, points: Floats, intrinsics: F
     q = in_camera(world_from_cam, np.asarray(points, dtype=np.float64))
     fx, fy, cx, cy, k1, k2, p1, p2 = (intrinsics[..., index] for index in range(8))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        x, y, inverse_depth = q[..., 0] / q[..., 2], q[..., 1] / q[..., 2], 1.0 / q[..., 2]
+        x, y = q[..., 0] / q[..., 2], q[..., 1] / q[..., 2]
         r2 = x * x + y * y
-        radial, slope = 1.0 + r2 * (k1 + k2 * r2), 2.0 * (k1 + 2.0 * k2 * r2)
+        radial = 1.0 + r2 * (k1 + k2 * r2)
         xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        mixed = x * y * slope + 2 * p1 * x + 2 * p2 * y
-        # Derivatives of (u, v) with respect to the normalised (x, y), then to q by the chain rule.
-        ux, uy = fx * (radial + x * x * slope + 2 * p1 * y + 6 * p2 * x), fx * mixed
-        vx, vy = fy * mixed, fy * (radial + y * y * slope + 6 * p1 * y + 2 * p2 * x)
-        d_q = np.stack(
-            [
-                np.stack([ux * inverse_depth, uy * inverse_depth, -(ux * x + uy * y) * inverse_depth], axis=-1),
-                np.stack([vx * inverse_depth, vy * inverse_depth, -(vx * x + vy * y) * inverse_depth], axis=-1),
-            ],
-            axis=-2,
-        )
+        d_q = _d_xy_d_q(q, x, y, intrinsics)
         xy_px = np.stack([fx * xd + cx, fy * yd + cy], axis=-1)
         zero, one = np.zeros_like(xd), np.ones_like(xd)
         d_intrinsics = np.stack(
@@ -110,7 +126,7 @@ def project_with_jacobians(world_from_cam: Floats, points: Floats, intrinsics: F
             axis=-2,
         )
         d_pose = np.concatenate([d_q @ skew(q), -d_q], axis=-1)
-        d_point = d_q @ np.swapaxes(world_from_cam[..., :3, :3], -1, -2)
+        d_point = d_q @ _transposed(world_from_cam)
     return Projection(
         xy_px=xy_px, depth=q[..., 2], d_xy_d_pose=d_pose, d_xy_d_point=d_point, d_xy_d_intrinsics=d_intrinsics
     )

@@ -83,7 +83,7 @@ def finish(problem: NetworkProblem, state: State, progress: Progress = silent) -
     kept = rest[spread(objectives[rest], most - (place is not None))]
     kept = kept if place is None else np.append(kept, place)
     kept = kept[np.lexsort((objectives[kept, 1], objectives[kept, 0], objectives[kept, 2]))]
-    bounds = problem.bounds(sorted({networks[row].f3 for row in kept}))
+    bounds = problem.bounds(sorted({networks[row].f3 for row in kept}), progress)
     return Design(
         networks=tuple(_bounded(networks[row], bounds) for row in kept.tolist()),
         history=SearchHistory(evaluations=state.evaluations, hypervolume=state.hypervolume),

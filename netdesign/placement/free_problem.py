@@ -4,7 +4,6 @@ No map of the visible can be drawn once and for all here: every station is looke
 (``known_stations``), and limited propagation adds up what the images contribute.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +14,6 @@ from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.photogrammetry.connectivity import loose_images
 from netdesign.photogrammetry.limited_error import WEAK, variances_of
-from netdesign.placement.bound import lower_bounds
 from netdesign.placement.distances import named_ends
 from netdesign.placement.encoding import Chromosomes
 from netdesign.placement.evaluation import excess
@@ -109,10 +107,6 @@ class FreeProblem(NetworkProblem):
         if self.joint_map is None:
             return np.ones(len(viewpoints), np.bool_)
         return np.array([len(station.joints) > 0 for station in self.stations.of(viewpoints)], np.bool_)
-
-    def bounds(self, sizes: Iterable[int]) -> dict[int, float]:
-        """Return proven lower bounds on f1 by number of images; empty where nothing is proved."""
-        return lower_bounds(self.task, sizes)
 
     def without_tour_limit(self) -> "FreeProblem":
         """Return the problem without requirements.max_tour; itself when there is none."""

@@ -29,47 +29,9 @@ import math
 import numpy as np
 
 from netdesign.model.arrays import Floats
-from netdesign.model.compiled import entry, part
+from netdesign.model.compiled import entry
+from netdesign.placement.sighting_weight import gain, tangent
 from netdesign.placement.visibility_cells import Words
-
-
-@part()
-def weight(
-    lowest: float, depth: float, lateral: float, moved: float, half: float, distance: float, facing: float,
-    travelled: float, gains: Floats, sigmas: Floats,
-) -> float:  # fmt: skip
-    """Return the largest omega of a point over a cell.
-
-    Args:
-        lowest: least depth of the point, m.  depth, lateral: along and from the optical axis, in the middle, m.
-        moved: how far the point moves in the camera's frame, m.  half: e, m.
-        distance, facing: from the camera in the middle, m; the latter along the normal.
-        travelled: how far the camera moves, m.
-        gains: (b + 1,) squared gain of the distortion, at most, in equal steps of the radius; last: the step.
-        sigmas: (y, x) focal² / sigma², at most, over depth and cosine; last row: lowest depth, step of the depth.
-    """
-    best = 1.0
-    if len(gains) > 2:
-        r = lateral / depth
-        shift = moved * math.sqrt(1.0 + r * r) / lowest
-        shift += (r + shift) * half / lowest
-        bins = len(gains) - 1
-        first = min(max(int((r - shift) / gains[bins]), 0), bins - 1)
-        last = min(max(int((r + shift) / gains[bins]), 0), bins - 1)
-        best = gains[first]
-        for k in range(first + 1, last + 1):
-            best = max(best, gains[k])
-    rows, columns = sigmas.shape[0] - 1, sigmas.shape[1]
-    if rows == 1:
-        return float(best * sigmas[0, 0])
-    sine, cosine = min(travelled / distance, 1.0), facing / distance
-    # cos(i - spread), at most 1
-    steepest = 1.0
-    if cosine < math.sqrt(1.0 - sine * sine):
-        steepest = cosine * math.sqrt(1.0 - sine * sine) + math.sqrt(max(1.0 - cosine * cosine, 0.0)) * sine
-    row = min(max(int((lowest - sigmas[rows, 0]) / sigmas[rows, 1]), 0), rows - 1)
-    column = min(max(int(steepest * columns), 0), columns - 1)
-    return float(best * sigmas[row, column])
 
 
 @entry()
@@ -88,34 +50,59 @@ def most_information(
         gains, sigmas: as in ``weight``.
     """
     result = np.zeros((len(directions), 3))
+    varying, curved = sigmas.shape[0] > 1, len(gains) > 2
     for cell in range(len(directions)):
         ux, uy, uz = directions[cell, 0], directions[cell, 1], directions[cell, 2]
         near, far, delta = depths[cell, 0], depths[cell, 1], deltas[cell]
         middle, half, sine = 0.5 * (near + far), 0.5 * (far - near), 2.0 * math.sin(0.5 * delta)
         ends = 2 if far > near else 1
-        sums = np.zeros((2, 5))  # value, gradient, curvature at either end
-        bend, reached = 0.0, False
+        sums = np.zeros((2, 5))  # value, gradient, what is added to them, at either end
+        bend, deep, reached = 0.0, 0.0, False
         for tag in range(len(points) // 4):
             if not (bits[cell, tag >> 6] >> np.uint64(tag & 63)) & np.uint64(1):
                 continue
             for j in range(4 * tag, 4 * tag + 4):
                 px, py, pz = points[j, 0], points[j, 1], points[j, 2]
                 size, along = squares[j, 0], ux * px + uy * py + uz * pz
-                trace, constant = squares[j, 1], squares[j, 2]
-                gx, gy, gz = squares[j, 3], squares[j, 4], squares[j, 5]
                 lowest = near - along - size * sine
                 if lowest <= 0.0:
                     reached = True
                     continue
-                scale = sigmas[0, 0]
-                if len(gains) > 2 or len(sigmas) > 2:
-                    scale = weight(
-                        lowest, middle - along, math.sqrt(max(size * size - along * along, 0.0)), size * sine, half,
-                        math.sqrt(size * size + middle * middle - 2.0 * middle * along),
-                        middle * (ux * normals[j, 0] + uy * normals[j, 1] + uz * normals[j, 2])
-                        - (px * normals[j, 0] + py * normals[j, 1] + pz * normals[j, 2]),
-                        middle * sine + half, gains, sigmas,
-                    )  # fmt: skip
+                best = 1.0
+                if curved:
+                    lateral = math.sqrt(max(size * size - along * along, 0.0))
+                    best = gain(lowest, middle - along, lateral, size * sine, half, gains)
+                # omega = scale + (wx wy wz) · u + rest, at most; its linear part changes by lean at most
+                scale, rest, late, lean, wx, wy, wz = best * sigmas[0, 0, 0], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                if varying:
+                    square = size * size + near * near - 2.0 * near * along
+                    away = math.sqrt(square)
+                    nearest = max(away - near * sine, lowest)
+                    nx, ny, nz = normals[j, 0], normals[j, 1], normals[j, 2]
+                    cosine = (near * (ux * nx + uy * ny + uz * nz) - (px * nx + py * ny + pz * nz)) / away
+                    fx = near * (nx / away + cosine * px / square)
+                    fy = near * (ny / away + cosine * py / square)
+                    fz = near * (nz / away + cosine * pz / square)
+                    radial = fx * ux + fy * uy + fz * uz
+                    slope = math.sqrt(max(fx * fx + fy * fy + fz * fz - radial * radial, 0.0)) * delta
+                    turn = 0.5 * (2.0 + 3.0 * near / nearest) * near / nearest * delta * delta
+                    slide = 2.0 * half * size / (nearest * nearest)
+                    z = near - along
+                    scale, by_cosine, by_depth, rest = tangent(
+                        z, lowest, cosine, slope + turn + slide, slope, size * delta / z, sigmas
+                    )
+                    by_depth /= z
+                    late = abs(by_cosine) * slide + rest * slide / (slope + turn + slide + 1e-300)
+                    fall = 0.5 * size * (z + size) * z / (lowest * lowest) * delta * delta
+                    rest += abs(by_cosine) * (turn + slide) + abs(by_depth) * fall
+                    wx, wy = by_cosine * fx - by_depth * px, by_cosine * fy - by_depth * py
+                    wz = by_cosine * fz - by_depth * pz
+                    radial = wx * ux + wy * uy + wz * uz
+                    lean = math.sqrt(max(wx * wx + wy * wy + wz * wz - radial * radial, 0.0)) * delta
+                    scale, rest, late, lean = best * scale, best * rest, best * late, best * lean
+                    wx, wy, wz = best * wx, best * wy, best * wz
+                trace, constant = squares[j, 1], squares[j, 2]
+                gx, gy, gz = squares[j, 3], squares[j, 4], squares[j, 5]
                 yx = squares[j, 6] * ux + squares[j, 7] * uy + squares[j, 8] * uz
                 yy = squares[j, 7] * ux + squares[j, 9] * uy + squares[j, 10] * uz
                 yz = squares[j, 8] * ux + squares[j, 10] * uy + squares[j, 11] * uz
@@ -126,32 +113,42 @@ def most_information(
                 y, k = yx * ux + yy * uy + yz * uz, kx * ux + ky * uy + kz * uz
                 for end in range(ends):
                     r = near if end == 0 else far
-                    z = r - along
-                    inverse = 1.0 / z
-                    factor = scale * inverse * inverse * inverse * inverse
+                    inverse = 1.0 / (r - along)
+                    factor = inverse * inverse * inverse * inverse
                     a = constant + r * r * (trace - y) + 2.0 * r * linear - k
                     steep = 4.0 * a * inverse
-                    sums[end, 0] += factor * a
-                    sums[end, 1] += factor * (2.0 * (r * gx - r * r * yx - kx) + steep * px)
-                    sums[end, 2] += factor * (2.0 * (r * gy - r * r * yy - ky) + steep * py)
-                    sums[end, 3] += factor * (2.0 * (r * gz - r * r * yz - kz) + steep * pz)
-                    inverse = 1.0 / (z - size * sine)
+                    value = factor * a
+                    dx = factor * (2.0 * (r * gx - r * r * yx - kx) + steep * px)
+                    dy = factor * (2.0 * (r * gy - r * r * yy - ky) + steep * py)
+                    dz = factor * (2.0 * (r * gz - r * r * yz - kz) + steep * pz)
+                    inverse = 1.0 / (r - along - size * sine)
                     ratio = size * inverse
                     slope, norm = 2.0 * r * squares[j, 18], r * r * squares[j, 19] + squares[j, 20]
-                    sums[end, 4] += scale * inverse * inverse * inverse * inverse * (
+                    curve = 0.5 * delta * delta * inverse * inverse * inverse * inverse * (
                         slope + 2.0 * norm + 8.0 * (slope + norm) * ratio
                         + trace * (r + size) ** 2 * (20.0 * ratio * ratio + 4.0 * ratio)
                     )  # fmt: skip
+                    sums[end, 0] += scale * value
+                    sums[end, 1] += scale * dx + value * wx
+                    sums[end, 2] += scale * dy + value * wy
+                    sums[end, 3] += scale * dz + value * wz
+                    sums[end, 4] += scale * curve
+                    if varying:
+                        radial = dx * ux + dy * uy + dz * uz
+                        change = math.sqrt(max(dx * dx + dy * dy + dz * dz - radial * radial, 0.0)) * delta + curve
+                        sums[end, 4] += rest * (value + change) + lean * change
+                        if end == 0:
+                            deep += late * value
                 inverse = 1.0 / lowest
-                bend += scale * trace * inverse * inverse * inverse * inverse
+                bend += (scale + lean + rest) * trace * inverse * inverse * inverse * inverse
         bend *= 0.6 * half * half
         highest, width = 0.0, 0.0
         for end in range(ends):
             radial = sums[end, 1] * ux + sums[end, 2] * uy + sums[end, 3] * uz
             slope = sums[end, 1] ** 2 + sums[end, 2] ** 2 + sums[end, 3] ** 2 - radial * radial
-            added = math.sqrt(max(slope, 0.0)) * delta + 0.5 * sums[end, 4] * delta * delta
+            added = math.sqrt(max(slope, 0.0)) * delta + sums[end, 4]
             highest, width = max(highest, sums[end, 0] + added), max(width, added)
-        result[cell, 0], result[cell, 1], result[cell, 2] = highest + bend, width, bend
+        result[cell, 0], result[cell, 1], result[cell, 2] = highest + bend, width - deep, bend + deep
         if reached:  # the cell's stations come too near for a bound
             result[cell, 0] = np.inf
     return result

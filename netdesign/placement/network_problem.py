@@ -10,12 +10,14 @@ import numpy as np
 
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.frames import sphere_directions
+from netdesign.model.progress import Progress, silent
 from netdesign.model.scene import CORNERS_PER_TAG
 from netdesign.model.task import Task
 from netdesign.motion.joint_map import JointMap
 from netdesign.photogrammetry.connectivity import loose_images
 from netdesign.photogrammetry.precision import sighting_sigma
 from netdesign.photogrammetry.total_trace import block_trace, total_trace
+from netdesign.placement.bound import lower_bounds
 from netdesign.placement.encoding import Chromosomes
 from netdesign.placement.optimal_design import information_of, rounded_networks
 from netdesign.placement.set_cover import Cover
@@ -69,9 +71,9 @@ class NetworkProblem(ABC):
     def reachable(self, viewpoints: Floats) -> Bools:
         """Return (k,) whether the arm can take viewpoints (k, d); all of them when motion is in the workspace."""
 
-    @abstractmethod
-    def bounds(self, sizes: Iterable[int]) -> dict[int, float]:
+    def bounds(self, sizes: Iterable[int], progress: Progress = silent) -> dict[int, float]:
         """Return proven lower bounds on f1 by number of images; empty where nothing is proved."""
+        return lower_bounds(self.task, sizes, progress)
 
     @abstractmethod
     def without_tour_limit(self) -> Self:

@@ -13,31 +13,30 @@ import numpy as np
 
 from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.task import Task
-from netdesign.photogrammetry.collinearity import project_with_jacobians
+from netdesign.photogrammetry.collinearity import point_jacobians
 from netdesign.photogrammetry.precision import sighting_sigma
 
 # The weights are settled when no candidate stands out from their mean by more than this.
 TOLERANCE = 1e-3
 ITERATIONS = 400
 STATIONS = 32  # of the optimum that take part in the exchange
+IMAGES = 64  # at a time: their derivatives stay near the processor
 PASSES = 2  # a third changes f1 by less than 0.3 %
 
 Score = Callable[[Bools, Floats], tuple[Floats, Floats]]
 """(bits (P, n), genes (P, n, d)) to (f1 (P,), violation (P,))."""
 
 
-def optimal_weights(flat: Floats, weights: Floats) -> tuple[Ints, Floats]:
+def optimal_weights(flat: Floats, weights: Floats, iterations: int = ITERATIONS) -> tuple[Ints, Floats]:
     """Improve ``weights`` (c,) of candidates with matrices (c, 6 m); return the rows that still matter, their weights.
 
     w_i grows with a power of h(v_i) = Σ_j tr(N_j⁻¹ M_ij N_j⁻¹) over the weighted mean of h; at the optimum h is the
     mean where w > 0 and smaller elsewhere. (The exponent 1/2 is proved to converge, 0.8 is faster here.)
     """
     active = np.arange(len(weights))
-    for iteration in range(ITERATIONS):
-        inverse = inverses(flat, weights)
-        square = (inverse @ inverse)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]] * [1.0, 2, 2, 1, 2, 1]
+    for iteration in range(iterations):
         # Never negative but for rounding, where a point has nearly parallel rays only.
-        height = np.maximum(flat @ square.ravel(), 0.0)
+        height = np.maximum(flat @ squares(inverses(flat, weights)).ravel(), 0.0)
         mean = float(weights @ height)
         if height.max() <= (1.0 + TOLERANCE) * mean:
             break
@@ -50,25 +49,38 @@ def optimal_weights(flat: Floats, weights: Floats) -> tuple[Ints, Floats]:
 
 
 def inverses(flat: Floats, weights: Floats) -> Floats:
-    """Return (m, 3, 3) inverses of Σ_i w_i M_ij for flattened matrices (c, 6 m): xx xy xz yy yz zz of every point."""
-    summed = (weights @ flat).reshape(-1, 6)
-    normal = summed[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    """Return (6, m) inverses of Σ_i w_i M_ij for flattened matrices (c, 6 m): xx xy xz yy yz zz of every point."""
+    xx, xy, xz, yy, yz, zz = np.ascontiguousarray((weights @ flat).reshape(-1, 6).T)
     # A point with nearly parallel rays only: its inverse need not be exact, but its square must not drown in rounding.
-    normal += 1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    return np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    little = 1e-6 * (xx + yy + zz)
+    xx, yy, zz = xx + little, yy + little, zz + little
+    x, y, z = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    adjugate = np.stack([x, y, z, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy])
+    return np.asarray(adjugate / (xx * x + xy * y + xz * z), dtype=np.float64)
+
+
+def squares(symmetric: Floats) -> Floats:
+    """Return (m, 6) such that the product with the rows of M is tr(S² M), from S (6, m) as of ``inverses``."""
+    xx, xy, xz, yy, yz, zz = symmetric
+    found = np.empty((len(xx), 6))
+    found[:, 0], found[:, 3], found[:, 5] = xx**2 + xy**2 + xz**2, xy**2 + yy**2 + yz**2, xz**2 + yz**2 + zz**2
+    found[:, 1] = 2.0 * (xx * xy + xy * yy + xz * yz)
+    found[:, 2] = 2.0 * (xx * xz + xy * yz + xz * zz)
+    found[:, 4] = 2.0 * (xy * xz + yy * yz + yz * zz)
+    return found
 
 
 def information_of(task: Task, world_from_cam: Floats, visible: Bools) -> Floats:
     """Return (c, 6 m) what images with poses (c, 4, 4) that see points visible (c, m) add to the normal matrices."""
-    points = task.scene.targets.points
-    found = np.empty((len(world_from_cam), len(points), 6))
-    for image, (pose, seen) in enumerate(zip(world_from_cam, visible, strict=True)):
-        derivative = project_with_jacobians(pose, points, task.camera.intrinsics).d_xy_d_point
-        weight = np.where(seen, 1.0 / sighting_sigma(task.camera, pose[None], task.scene.targets)[0] ** 2, 0.0)
-        whitened = np.sqrt(weight)[:, None, None] * derivative
-        for place, (row, column) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
-            found[image, :, place] = whitened[:, 0, row] * whitened[:, 0, column]
-            found[image, :, place] += whitened[:, 1, row] * whitened[:, 1, column]
+    points, found = task.scene.targets.points, np.zeros((*visible.shape, 6))
+    for first in range(0, len(visible), IMAGES):
+        poses, seen = world_from_cam[first : first + IMAGES], visible[first : first + IMAGES]
+        image, point = np.nonzero(seen)
+        derivative = point_jacobians(poses[image], points[point], task.camera.intrinsics)
+        weight = 1.0 / sighting_sigma(task.camera, poses, task.scene.targets)[seen] ** 2
+        x, y = np.moveaxis(np.sqrt(weight)[:, None, None] * derivative, 1, 0)
+        upper = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+        found[first + image, point] = x[:, upper[0]] * x[:, upper[1]] + y[:, upper[0]] * y[:, upper[1]]
     return found.reshape(len(found), 6 * len(points))
 
 

@@ -1,6 +1,6 @@
 """Camera network design on the viewing sphere as a problem for ``search``: evaluation, neighbours, what is sure."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -11,7 +11,6 @@ import numpy as np
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.progress import Progress, silent
 from netdesign.model.task import Task
-from netdesign.placement.bound import lower_bounds
 from netdesign.placement.distances import named_ends
 from netdesign.placement.encoding import LARGEST_STEP, SMALLEST_STEP, Chromosomes
 from netdesign.placement.evaluation import evaluate_networks, joint_tours, workspace_tours
@@ -157,10 +156,6 @@ class Problem(NetworkProblem):
         if self.joint_map is None:
             return np.ones(len(viewpoints), np.bool_)
         return self.joint_map.reachable(viewpoints)
-
-    def bounds(self, sizes: Iterable[int]) -> dict[int, float]:
-        """Return proven lower bounds on f1 by number of images; empty where nothing is proved."""
-        return lower_bounds(self.task, sizes)
 
     def without_tour_limit(self) -> "Problem":
         """Return the problem without requirements.max_tour; itself when there is none."""

@@ -59,7 +59,16 @@ class Cells:
         """(c, words) tags that some station of the cell may see."""
         return self.sure | self.maybe
 
-    def take(self, rows: Bools | Ints) -> "Cells":
+    def within(self, angle: float) -> Bools:
+        """(c,) whether the cell lies within an angle about its middle, as seen from the centre."""
+        return (self.deltas <= angle) & (self.half[:, 2] <= angle * self.middle[:, 2])
+
+    @property
+    def points(self) -> "Cells":
+        """Their middles, as if these saw all the tags that some station of the cell may see."""
+        return Cells(middle=self.middle, half=np.zeros_like(self.half), sure=self.possible, maybe=self.maybe * 0)
+
+    def take(self, rows: Bools | Ints | slice) -> "Cells":
         """Return the cells of ``rows``."""
         return Cells(middle=self.middle[rows], half=self.half[rows], sure=self.sure[rows], maybe=self.maybe[rows])
 
@@ -98,9 +107,7 @@ class StationCells:
         columns = [np.tile(alpha, len(beta)), np.repeat(beta, len(alpha)), np.full(count, (near + far) / 2)]
         middle = np.column_stack(columns)
         half = np.tile([half_alpha, half_beta, (far - near) / 2], (count, 1))
-        every = np.zeros((count, -(-self.tag_count // 64)), np.uint64)
-        for tag in range(self.tag_count):
-            every[:, tag // 64] |= np.uint64(1) << np.uint64(tag % 64)
+        every = self.words(np.ones(self.tag_count, np.bool_), count)
         return self._settled(Cells(middle=middle, half=half, sure=np.zeros_like(every), maybe=every))
 
     def parts(self, cells: Cells, axis: Ints) -> Cells:
@@ -111,6 +118,33 @@ class StationCells:
         step[rows, axis] = half[rows, axis]
         both = [replace(cells, middle=cells.middle + sign * step, half=half) for sign in (-1.0, 1.0)]
         return self._settled(both[0].joined(both[1]))
+
+    def words(self, tags: Bools, count: int) -> Words:
+        """Return (count, words) rows of the tags (g,)."""
+        bits = np.zeros((count, -(-self.tag_count // 64)), np.uint64)
+        for tag in np.flatnonzero(tags).tolist():
+            bits[:, tag // 64] |= np.uint64(1) << np.uint64(tag % 64)
+        return bits
+
+    def stations(self, places: Floats, tags: Words) -> Cells:
+        """Return stations at places (s, 3), azimuth, elevation and distance, as cells without width.
+
+        Their ``sure`` are those of ``tags`` (s, words) that they see; of a free roll every tag that some roll sees.
+        """
+        field = self.field if self.sphere.roll is not None else np.array([self.field[1], self.field[1], 1.0])
+        found = Cells(middle=places, half=np.zeros_like(places), sure=np.zeros_like(tags), maybe=tags.copy())
+        self._settle(found, field)
+        return replace(found, maybe=np.zeros_like(tags))
+
+    def samples(self, cells: Cells) -> Cells:
+        """Return stations in the middle of cells, also at their nearest and farthest admissible distance."""
+        ends, there = [cells.middle[:, 2]], np.ones(len(cells), np.bool_)
+        if self.sphere.depth is not None:
+            least, largest = self.sphere.depth.limits(cells.directions)
+            there = (least <= largest) & (least > 0.0)  # a box may hold the centre itself
+            ends = [np.clip(end, least, np.maximum(least, largest)) for end in (*cells.depths.T, cells.middle[:, 2])]
+        places = np.concatenate([np.column_stack([cells.middle[there, :2], end[there]]) for end in ends])
+        return self.stations(places, np.tile(cells.possible[there], (len(ends), 1)))
 
     def _settled(self, cells: Cells) -> Cells:
         """Cells cut down to the admissible distances, their tags decided as far as possible; the empty ones dropped."""
@@ -124,15 +158,19 @@ class StationCells:
             middle[:, 2], half[:, 2] = 0.5 * (near + far), 0.5 * np.maximum(far - near, 0.0)
             cells = replace(cells, middle=middle, half=half).take(there)
         cells = replace(cells, sure=cells.sure.copy(), maybe=cells.maybe.copy())
+        self._settle(cells, self.field)
+        return cells.take((cells.possible != 0).any(axis=1))
+
+    def _settle(self, cells: Cells, field: Floats) -> None:
+        """Decide the tags that the cells may see, in place."""
         delta = cells.deltas
         polar = np.minimum(0.5 * np.pi - cells.middle[:, 1] + delta, np.pi)
         turn = delta if self.sphere.roll is None else delta / np.maximum(np.cos(0.5 * polar), 1e-9)
         settle(
             self._poses(cells), np.ascontiguousarray(cells.middle[:, 2]), np.ascontiguousarray(cells.half[:, 2]),
             np.stack([delta, turn], axis=1), self.points, self.away, self.normals, self.shadowed, self.settings,
-            self.field, self.tag_size, self.mesh, cells.sure, cells.maybe,
+            field, self.tag_size, self.mesh, cells.sure, cells.maybe,
         )  # fmt: skip
-        return cells.take((cells.possible != 0).any(axis=1))
 
     def _poses(self, cells: Cells) -> Floats:
         """Return world_from_cam (c, 4, 4) in the middle of the cells."""

@@ -112,11 +112,11 @@ class VisibilityMap:
 
     def sure_tags(self, cells: Ints) -> Bools:
         """Return (k, g): tag g is seen from every viewpoint of cell k."""
-        return _unpack(self.sure[cells], self.tag_count)
+        return unpacked(self.sure[cells], self.tag_count)
 
     def possible_tags(self, cells: Ints) -> Bools:
         """Return (k, g): tag g is seen, or the map cannot exclude it, from some viewpoint of cell k."""
-        return _unpack(self.sure[cells] | self.maybe[cells], self.tag_count)
+        return unpacked(self.sure[cells] | self.maybe[cells], self.tag_count)
 
 
 @part(allocates=False)
@@ -213,7 +213,8 @@ def spread_angle(beta: Floats, half_alpha: Floats, half_beta: Floats) -> Floats:
     return np.asarray(2.0 * np.arcsin(np.minimum(np.sqrt(square), 1.0)))
 
 
-def _unpack(rows: Words, count: int) -> Bools:
+def unpacked(rows: Words, count: int) -> Bools:
+    """Return (…, count) the tags of rows of bits (…, words)."""
     bits = np.unpackbits(np.ascontiguousarray(rows).view(np.uint8), axis=-1, bitorder="little")
     return bits[..., :count].astype(bool)
 

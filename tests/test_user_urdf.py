@@ -114,6 +114,8 @@ def test_meshes_are_found_and_go_with_the_run(tmp_path, style):
     chain = chain_of(path)
     assert len(chain.shapes) == 7
     write_resolved(resolve(path), tmp_path / "run")
+    rerun = resolve(tmp_path / "run/study.toml")
+    assert rerun.sha256 == resolve(path).sha256  # what the run's own study gives is the run, byte for byte
     shutil.rmtree(tmp_path / "ws")
     again = chain_of(tmp_path / "run/study.toml")
     for one, other in zip(chain.shapes, again.shapes, strict=True):

@@ -1,5 +1,6 @@
 """A URDF as a user has it, made ready to be loaded: meshes found, what is only looked at left out, limits filled in."""
 
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 from netdesign.errors import InputError
 
 PACKAGE_SCHEME, FILE_SCHEME = "package://", "file://"
+_NUMBER = re.compile(r"^\d\d-")
 
 
 def read_urdf(urdf: Path) -> ElementTree.Element:
@@ -97,7 +99,8 @@ def bundled_urdf(urdf: Path, package_dirs: tuple[Path, ...], shared: Path) -> tu
         if found.is_relative_to(shared.resolve()):
             continue
         if found not in names:
-            names[found] = f"meshes/{len(names):02d}-{found.name}"
+            # A run's own URDF has numbered meshes already; its study has to give the same run.
+            names[found] = f"meshes/{len(names):02d}-{_NUMBER.sub('', found.name)}"
             files[names[found]] = found
         mesh.set("filename", names[found])
     return ElementTree.tostring(robot, encoding="unicode") + "\n", files

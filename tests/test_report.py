@@ -243,7 +243,24 @@ def test_the_caption_of_the_reach_tells_what_its_dots_stand_for():
         caption = words.reach_caption(shell)
         assert "sphere" not in caption
         assert "share of the directions" in caption
-        assert ("nearest, middle and farthest" in caption) == told
+        assert ("the nearest, the middle and the farthest" in caption) == told
+
+
+def test_distances_have_a_disc_each_in_the_picture_of_the_reach():
+    wide = replace(sphere(), depth=Depth(shape="ellipsoid", low=np.full(3, 0.5), high=np.full(3, 0.7)))
+    viewpoints = np.column_stack([np.zeros((9, 2)), np.tile([0.0, 0.5, 1.0], 3)])
+    found = reach.Reach(viewpoints=viewpoints, reasons=("free", "free", "out of reach") * 3)
+    assert [name for name, _ in found.shells()] == ["nearest stations", "halfway", "farthest stations"]
+    assert (np.array([own for _, own in found.shells()]).sum(axis=0) == 1).all()
+    figure = Figure()
+    colours = np.array([reach.COLOURS[reason] for reason in found.reasons])
+    reach._discs(figure, found, colours, wide.cameras(viewpoints[:3])[:, :3, 3])
+    drawn = [{tuple(rgba) for rgba in axes.collections[0].get_facecolors()} for axes in figure.axes]
+    assert len(drawn) == 4
+    assert [len(colours) for colours in drawn[:3]] == [1, 1, 1]  # no disc mixes two distances
+    assert drawn[0] == drawn[1] != drawn[2]
+    alone = reach.Reach(viewpoints=viewpoints[:, :2], reasons=found.reasons)
+    assert len(alone.shells()) == 1
 
 
 def test_a_gridded_box_is_closed_and_faces_outwards():

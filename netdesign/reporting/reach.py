@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from netdesign.model.arrays import Floats
-from netdesign.model.frames import sphere_directions
+from netdesign.model.arrays import Bools, Floats
+from netdesign.model.frames import sphere_directions, viewpoints_of
 from netdesign.reporting import palette
 from netdesign.reporting.drawing import draw_solids, frustum_lines
 from netdesign.reporting.mesh import PartMesh
@@ -28,6 +28,9 @@ COLOURS = {
 }
 
 
+SHELLS = {0.0: "nearest stations", 0.5: "halfway", 1.0: "farthest stations"}  # by the share of the depth
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reach:
     """Why stations are refused ("free": they are not).
@@ -42,6 +45,13 @@ class Reach:
         """Return the share of the sphere of every reason that occurs, the free one first."""
         return {name: self.reasons.count(name) / len(self.reasons) for name in COLOURS if name in self.reasons}
 
+    def shells(self) -> list[tuple[str, Bools]]:
+        """Return the name of every shell, the nearest first, and its viewpoints (k,); a single one has no name."""
+        depths = np.unique(self.viewpoints[:, 2:])
+        if len(depths) < 2:
+            return [("", np.ones(len(self.viewpoints), np.bool_))]
+        return [(SHELLS.get(depth, f"{depth:.0%}"), self.viewpoints[:, 2] == depth) for depth in depths.tolist()]
+
 
 def reach_figure(record: RunRecord, mesh: PartMesh, reach: Reach) -> Figure | None:
     """Return the cell with the sphere around it, and the sphere from above; None without planned joints."""
@@ -54,7 +64,7 @@ def reach_figure(record: RunRecord, mesh: PartMesh, reach: Reach) -> Figure | No
     colours = np.array([COLOURS[reason] for reason in reach.reasons])
     with rc_context(STYLE):
         figure = Figure(figsize=(9.6, 5.2))
-        left, right = figure.add_axes((0.0, 0.0, 0.54, 1.0)), figure.add_axes((0.55, 0.02, 0.44, 0.80))
+        left = figure.add_axes((0.0, 0.0, 0.54, 1.0))
         behind = CELL_EYE.nearness(positions) < CELL_EYE.nearness(sphere.centre)
         flat = CELL_EYE.flat(positions)
         left.scatter(flat[behind, 0], flat[behind, 1], s=4, c=colours[behind], alpha=0.35, linewidths=0)
@@ -65,23 +75,45 @@ def reach_figure(record: RunRecord, mesh: PartMesh, reach: Reach) -> Figure | No
         left.add_collection(LineCollection(list(CELL_EYE.flat(frusta)), colors="black", linewidths=0.7, zorder=4))
         left.plot(*CELL_EYE.flat(poses[:, :3, 3]).T, color="black", linewidth=1.0, zorder=4)
         frame(left)
-        _from_above(right, reach, colours, poses[:, :3, 3] - sphere.centre)
+        above = _discs(figure, reach, colours, poses[:, :3, 3] - sphere.centre)
         for name, share in reach.shares().items():
-            right.scatter([], [], s=24, c=COLOURS[name], label=f"{name} {share:.1%}")
-        right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, fontsize=7.5, handletextpad=0.2)
+            above.scatter([], [], s=24, c=COLOURS[name], label=f"{name} {share:.1%}")
+        figure.legend(loc="lower center", bbox_to_anchor=(0.77, 0.82), ncols=2, fontsize=7.5, handletextpad=0.2)
     return figure
 
 
-def _from_above(axes: Axes, reach: Reach, colours: Floats, stations: Floats) -> None:
-    """Draw the sphere from above in Lambert's equal-area projection, stations and tour on it."""
-    x, y = _disc(sphere_directions(reach.viewpoints))
-    axes.scatter(x, y, s=7, c=colours, linewidths=0)
-    x, y = _disc(stations / np.linalg.norm(stations, axis=1, keepdims=True))
+def _discs(figure: Figure, reach: Reach, colours: Floats, stations: Floats) -> Axes:
+    """Draw the directions from above in Lambert's equal-area projection, stations and tour on them.
+
+    Shells have a disc each, one over the other they would hide what the distance does; the tour has the last one.
+    """
+    shells = reach.shells()
+    if len(shells) == 1:
+        axes = figure.add_axes((0.55, 0.02, 0.44, 0.80))
+        axes.scatter(*_disc(sphere_directions(reach.viewpoints)), s=7, c=colours, linewidths=0)
+        _tour(axes, stations)
+        frame(axes)
+        return axes
+    for number, (name, own) in enumerate([*shells, ("the tour", np.ones(len(colours), np.bool_))]):
+        row, column = divmod(number, 2)
+        axes = figure.add_axes((0.55 + 0.22 * column, 0.42 - 0.41 * row, 0.21, 0.36))
+        x, y = _disc(sphere_directions(reach.viewpoints[own]))
+        if number < len(shells):
+            axes.scatter(x, y, s=4, c=colours[own], linewidths=0)
+        else:
+            axes.scatter(x, y, s=1, c="#dddddd", linewidths=0)
+            _tour(axes, stations)
+        axes.set_title(name, fontsize=7.5, pad=2)
+        frame(axes)
+    return axes
+
+
+def _tour(axes: Axes, stations: Floats) -> None:
+    x, y = _disc(sphere_directions(viewpoints_of(stations)))
     axes.plot(x, y, color="black", linewidth=1.0)
     axes.scatter(x, y, s=16, color="white", edgecolors="black", linewidths=0.9, zorder=3)
     for number, (a, b) in enumerate(zip(x, y, strict=True), start=1):
         axes.annotate(str(number), (a, b), xytext=(4, 4), textcoords="offset points", fontsize=7.5)
-    frame(axes)
 
 
 def _disc(directions: Floats) -> tuple[Floats, Floats]:

@@ -214,8 +214,13 @@ def reach_caption(sphere: ViewingSphere) -> str:
     if sphere.depth is None:
         dots, above, free = "of the sphere", "the sphere from above", "A direction is free where all four neighbours in"
     else:
-        where = " at its nearest, middle and farthest distance in turn" if sphere.depth.has_width else ""
-        dots, above = f"of the directions{where}", "the directions from above"
+        wide = sphere.depth.has_width
+        dots = "of the directions at the nearest, the middle and the farthest distance" if wide else "of the directions"
+        above = (
+            "the directions from above, a disc for each distance and one for the tour"
+            if wide
+            else "the directions from above"
+        )
         free = "The search asks the robot at every station exactly; a dot is free where all four neighbours in"
     return (
         f"What the robot reaches, every dot the same share {dots}, and the tour of the recommended network. Right: "

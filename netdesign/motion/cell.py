@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from netdesign.errors import InputError
 from netdesign.model.arrays import Floats, Ints
@@ -11,7 +12,7 @@ from netdesign.model.scene import Part
 from netdesign.model.stations import ViewingSphere
 from netdesign.model.task import RobotCell
 from netdesign.motion.capsules import fit_capsules
-from netdesign.motion.collision import SKIP, TOUCH, Body, near_box, overlapping, part_field
+from netdesign.motion.collision import FREE, SELF, SKIP, TOUCH, Body, near_box, overlapping, part_field, states
 from netdesign.motion.kinematics import restarts
 from netdesign.motion.mesh_collision import MeshCell, camera_capsules, learn_pairs, pairs_key
 from netdesign.motion.robot import Chain, load_chain
@@ -19,9 +20,10 @@ from netdesign.motion.stored import Arrays, content_key, stored
 from netdesign.motion.ur_kinematics import UrArm, ur_arm
 
 _SIGHT_BALLS = 8
-_VERSION = 5
+_VERSION = 6
 _SAMPLES = 300
 _NEARLY_ALWAYS = 0.8
+_OFTEN = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +36,7 @@ class ArmCell:
         ur: closed form of ``placed``, None for arms built otherwise.
         body: what the collision kernels take.
         loose: capsules too coarse for this arm were left out of its self test: a plan asks the real meshes.
+        doubtful: (d, 2) solids whose capsules were left out although they often touch: the search asks their meshes.
         key: SHA-256 of everything that decides whether a configuration is free.
     """
 
@@ -43,6 +46,7 @@ class ArmCell:
     ur: UrArm | None
     body: Body
     loose: bool
+    doubtful: Ints
     meshes: MeshCell
     key: str
 
@@ -50,6 +54,14 @@ class ArmCell:
     def weights(self) -> Floats:
         """(r,) lambda of the source paper."""
         return np.array(self.cell.joint_weights or np.ones(len(self.chain)), dtype=np.float64)
+
+    def states(self, joints: Floats) -> NDArray[np.int8]:
+        """Return the state (n,) of joints (n, r), see ``collision``: by capsules, by meshes where these do not tell."""
+        state: NDArray[np.int8] = states(self.body, joints)
+        for row in np.flatnonzero(state == FREE) if len(self.doubtful) else ():
+            if self.meshes.touches(joints[row], self.doubtful):
+                state[row] = SELF
+        return state
 
     @property
     def coaxial(self) -> bool:
@@ -110,11 +122,13 @@ def load_arm(cell: RobotCell, sphere: ViewingSphere, part: Part) -> ArmCell:
         sight=np.stack([share, share * reach], axis=1),
         centre=np.array(sphere.centre),
     )
-    body, loose = _without_false_alarms(body, meshes, placed)
-    key = content_key("arm cell", _VERSION, chain.lower, chain.upper, *[np.asarray(value) for value in body])
+    body, loose, doubtful = _without_false_alarms(body, meshes, placed, owner)
+    arrays = [np.asarray(value) for value in body]
     return ArmCell(
-        cell=cell, chain=chain, placed=placed, ur=ur_arm(placed), body=body, loose=loose, meshes=meshes, key=key
-    )
+        cell=cell, chain=chain, placed=placed, ur=ur_arm(placed), body=body, meshes=meshes,
+        loose=loose, doubtful=doubtful,
+        key=content_key("arm cell", _VERSION, chain.lower, chain.upper, doubtful, *arrays),
+    )  # fmt: skip
 
 
 def _check_home(cell: RobotCell, chain: Chain, meshes: MeshCell) -> None:
@@ -132,20 +146,26 @@ def _check_home(cell: RobotCell, chain: Chain, meshes: MeshCell) -> None:
         raise InputError(f"robot.home_rad: expected joints at which nothing touches, found: {contact}")
 
 
-def _without_false_alarms(body: Body, meshes: MeshCell, placed: Chain) -> tuple[Body, bool]:
+def _without_false_alarms(body: Body, meshes: MeshCell, placed: Chain, owner: Ints) -> tuple[Body, bool, Ints]:
     """Return the body without the capsule pairs that overlap in nearly every configuration that is free in truth.
 
     (The hub of a UR5's upper arm and its base, say: near by construction, and capsules are rounder than links.)
-    Likewise of link 2 and what is near the base.
+    Likewise of link 2 and what is near the base. Further whether anything was left out, and the pairs of solids (d, 2)
+    among it that often do touch. ``owner``: the solid of every capsule.
     """
 
     def build() -> Arrays:
-        free = np.array([q for q in restarts(placed, _SAMPLES, seed=2) if not meshes.touches_itself(q)])
+        drawn = restarts(placed, _SAMPLES, seed=2)
+        free = np.array([q for q in drawn if not meshes.touches_itself(q)])
         if not len(free):
-            return {"keep": np.ones(len(body.pairs), dtype=np.bool_)}
-        return {"keep": overlapping(body, free) < _NEARLY_ALWAYS * len(free)}
+            return {"keep": np.ones(len(body.pairs), dtype=np.bool_), "doubtful": np.zeros((0, 2), dtype=np.int64)}
+        keep = overlapping(body, free) < _NEARLY_ALWAYS * len(free)
+        left_out = np.unique(owner[body.pairs[~keep]].reshape(-1, 2), axis=0)
+        often = [np.mean([meshes.touches(q, pair[None]) for q in drawn]) > _OFTEN for pair in left_out]
+        return {"keep": keep, "doubtful": left_out[np.array(often, dtype=np.bool_)]}
 
-    keep = stored(content_key("false alarms", _VERSION, body.capsules, body.pairs, body.placements), build)["keep"]
+    kept = stored(content_key("false alarms", _VERSION, body.capsules, body.pairs, body.placements), build)
+    keep = kept["keep"]
     mounting, starts = body.mounting.copy(), restarts(placed, _SAMPLES, seed=2)
     for box in meshes.beneath.tolist():
         # Where the capsules are too near at every angle and the meshes are not, these have to say when they are.
@@ -153,7 +173,7 @@ def _without_false_alarms(body: Body, meshes: MeshCell, placed: Chain) -> tuple[
             if near_box(body._replace(mounting=mounting), box, starts).all():
                 mounting[box] = easier
     loose = not keep.all() or bool((mounting != body.mounting).any())
-    return body._replace(pairs=np.ascontiguousarray(body.pairs[keep]), mounting=mounting), loose
+    return body._replace(pairs=np.ascontiguousarray(body.pairs[keep]), mounting=mounting), loose, kept["doubtful"]
 
 
 def _moved(capsules: Floats, target_from_source: Floats) -> Floats:

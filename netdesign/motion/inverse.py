@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.compiled import entry
 from netdesign.motion.cell import ArmCell
-from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION, states
+from netdesign.motion.collision import FREE, LIMITS, NO_SOLUTION
 from netdesign.motion.kinematics import into_limits
 from netdesign.motion.ur_kinematics import BRANCHES, ur_branches
 
@@ -26,7 +26,7 @@ def tested(arm: ArmCell, joints: Floats, found: Bools, rest: float) -> NDArray[n
     flat = joints.reshape(-1, joints.shape[-1])
     state: NDArray[np.int8] = _limited(arm.placed.lower, arm.placed.upper, flat, found.reshape(-1), rest)
     within = state == FREE
-    state[within] = states(arm.body, flat[within])
+    state[within] = arm.states(flat[within])
     return state.reshape(found.shape)
 
 

@@ -16,7 +16,7 @@ from netdesign.model.arrays import Bools, Floats, Ints
 from netdesign.model.frames import pose
 from netdesign.model.scene import Part
 from netdesign.model.task import RobotCell
-from netdesign.motion.collision import FREE, KEEP, OBSTACLE, TOUCH, TURN_STEPS
+from netdesign.motion.collision import FREE, KEEP, OBSTACLE, SELF, TOUCH, TURN_STEPS
 from netdesign.motion.collision import PART as STATE_PART
 from netdesign.motion.kinematics import link_poses, restarts
 from netdesign.motion.robot import Chain
@@ -192,8 +192,19 @@ class MeshCell:
 
     def touches_itself(self, q: Floats) -> bool:
         """Return whether the arm touches itself at joints q (r,)."""
+        return self.touches(q, self.pairs)
+
+    def touches(self, q: Floats, pairs: Ints) -> bool:
+        """Return whether any of some pairs of solids (s, 2) touch at joints q (r,)."""
         self.place(q)
-        return any(self.touching(first, second) for first, second in self.pairs.tolist())
+        return any(self.touching(first, second) for first, second in pairs.tolist())
+
+    def state(self, q: Floats) -> int:
+        """Return FREE, PART, OBSTACLE or SELF at joints q (r,)."""
+        found = self.contact(q)
+        if not found:
+            return FREE
+        return STATE_PART if found.endswith(PART) else OBSTACLE if " touches obstacle " in found else SELF
 
     @property
     def mounting(self) -> Ints:

@@ -59,7 +59,8 @@ def exact_options(joint_map: JointMap, viewpoints: Floats, given: Floats = NO_PO
         state = states(arm.body, joints) if len(joints) else np.zeros(0, dtype=np.int8)
         free = state == FREE
         if arm.loose:
-            free[free] = [not arm.meshes.contact(q) for q in joints[free]]
+            state[free] = [arm.meshes.state(q) for q in joints[free]]
+            free = state == FREE
         if len(joints) and not free.any():
             free = _free_on_meshes(arm, joints)
             reason = REASONS[int(np.bincount(state).argmax())]
@@ -123,7 +124,7 @@ def search_options(joint_map: JointMap, viewpoints: Floats) -> list[Floats]:
     arm, sphere, rolls = joint_map.arm, joint_map.sphere, joint_map.rolls
     if arm.ur is None:
         solved = [_sheet_options(joint_map, viewpoint)[0] for viewpoint in viewpoints]
-        return [joints[states(arm.body, joints) == FREE] if len(joints) else joints for joints in solved]
+        return [joints[arm.states(joints) == FREE] if len(joints) else joints for joints in solved]
     targets = sphere.cameras(np.repeat(viewpoints, len(rolls), axis=0), np.tile(rolls, len(viewpoints)))
     joints, found = solve_closed(arm, targets)
     free = tested(arm, joints, found, rest_of(arm) if joint_map.follows else math.nan) == FREE

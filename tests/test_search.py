@@ -226,3 +226,35 @@ def test_engines_improve_resume_and_repeat(engine, tmp_path):
     with pytest.raises(InputError, match="readable"):
         load(tmp_path / "state.npz", "key")
     assert list(tmp_path.iterdir()) == [tmp_path / "state.npz"]
+
+
+def test_parents_that_are_crossed_late_are_neighbours_on_the_front():
+    """Of sizes next to each other, and within a fifth of the staircase, whatever its length; both ends take part."""
+    pairs = []
+
+    class Watched(Dots):
+        def vary_structured(self, rng, first, second):
+            pairs.append((first, second))
+            return super().vary_structured(rng, first, second)
+
+    states = []
+    run(Watched(), "memetic", 20, 60, 5, on_step=states.append)
+    late = [(first, second) for first, second in pairs if len(first) == 80]
+    assert len(late) >= 3
+    archives = [state.archive for state in states]
+    for first, second in late:
+        archive = next(
+            archive for archive in archives
+            if {row.tobytes() for row in first.objectives} <= {row.tobytes() for row in archive.members.objectives}
+        )  # fmt: skip
+        sizes, starts, counts = np.unique(archive.sizes, return_index=True, return_counts=True)
+        row_of = {row.tobytes(): index for index, row in enumerate(archive.members.objectives)}
+        one, two = (np.array([row_of[row.tobytes()] for row in parents.objectives]) for parents in (first, second))
+        layer_one, layer_two = (np.searchsorted(starts, rows, side="right") - 1 for rows in (one, two))
+        assert np.abs(layer_one - layer_two).max() <= 1
+        place_one, place_two = (
+            (rows - starts[layer]) / counts[layer] for rows, layer in ((one, layer_one), (two, layer_two))
+        )
+        slack = 1 / counts[layer_one] + 1 / counts[layer_two]
+        assert (np.abs(place_one - place_two) <= 0.2 + slack).all()
+        assert len(np.unique(layer_one)) == len(sizes)

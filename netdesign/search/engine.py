@@ -6,7 +6,8 @@ outside the evaluation: a seed gives one result, whatever the number of threads 
 
 * ``nsga2``: tournaments, uniform and SBX crossover, bit-flip and polynomial mutation, elitist survival, no copies.
 * ``memetic``: starts from seeds (set cover), spends a fifth of the generations (at most 60) on NSGA-II with operators
-  that know what a gene means, then improves members of the archive one gene at a time until the budget is used.
+  that know what a gene means, then improves members of the archive one gene at a time until the budget is used; every
+  fourth time neighbours on the front are crossed instead, which brings together what was improved apart.
 """
 
 from collections.abc import Callable, Iterator
@@ -33,6 +34,8 @@ STRIDE = 10  # generations of breeding between two updates of the archive
 FEWEST_PICKS, MOST_PICKS = 8, 32  # members improved between two updates of the archive, a sixth of the population
 SPREAD = 0.2  # of the preferences about the place on the staircase
 MEMBERS_PER_PICK = 50  # more of them once the archive is long, for its update takes as long as it is
+CROSSED_EVERY, PAIRS = 4, 4  # steps of the local search, and pairs of parents then, for each of the population
+NEARBY = 0.2  # how far along the staircase, as a share of it, the other parent may be
 
 OnStep = Callable[[State], None]
 
@@ -95,6 +98,8 @@ def steps(problem: SearchProblem, engine: Engine, state: State, population: int,
             children = offspring(rng, problem, state.population, state.ranks, state.crowding, vary)
             survivors, ranks, crowding = survive(joined([state.population, children]), population)
             state = replace(state, population=survivors, ranks=ranks, crowding=crowding)
+        elif state.step % CROSSED_EVERY == 0:
+            children = evaluated(problem.evaluate, *_crossed(rng, problem, state, PAIRS * population))
         else:
             children = problem.improve(rng, *_picks(rng, state, population))
         pending = (*state.pending, children)
@@ -153,13 +158,32 @@ def _picks(rng: np.random.Generator, state: State, population: int) -> tuple[Pop
     Of a size one of its staircase: where that falls steeply, at the small first objectives, the first counts most.
     """
     count = max(min(MOST_PICKS, max(FEWEST_PICKS, population // 6)), len(state.archive) // MEMBERS_PER_PICK)
-    sizes: Ints = state.archive.sizes
-    different, starts, counts = np.unique(sizes, return_index=True, return_counts=True)
-    layer = rng.integers(0, len(different), count)
-    place = rng.random(count)
-    rows = starts[layer] + np.floor(place * counts[layer]).astype(np.int64)
+    layer, place = _places(rng, state, count)
+    rows = _rows(state, layer, place)
     preference = np.clip(1.0 - place + SPREAD * rng.uniform(-1.0, 1.0, count), 0.0, 1.0)
     return state.archive.members.take(rows), preference
+
+
+def _crossed(rng: np.random.Generator, problem: SearchProblem, state: State, pairs: int) -> tuple[Bools, Floats]:
+    """Chromosomes of the children of neighbours on the front, of as many images or those of one size more or less."""
+    layer, place = _places(rng, state, pairs)
+    other = np.clip(layer + rng.integers(-1, 2, pairs), 0, len(np.unique(state.archive.sizes)) - 1)
+    near = np.clip(place + NEARBY * rng.uniform(-1.0, 1.0, pairs), 0.0, np.nextafter(1.0, 0.0))
+    members = state.archive.members
+    first, second = members.take(_rows(state, layer, place)), members.take(_rows(state, other, near))
+    return problem.vary_structured(rng, first, second)
+
+
+def _places(rng: np.random.Generator, state: State, count: int) -> tuple[Ints, Floats]:
+    """Sizes of the archive at random, so that none is neglected, and places in [0, 1) along their staircases."""
+    layer: Ints = rng.integers(0, len(np.unique(state.archive.sizes)), count)
+    return layer, rng.random(count)
+
+
+def _rows(state: State, layer: Ints, place: Floats) -> Ints:
+    """Rows (k,) of the archive by layer, counted among its sizes, and place in [0, 1) along that layer's staircase."""
+    _, starts, counts = np.unique(state.archive.sizes, return_index=True, return_counts=True)
+    return np.asarray(starts[layer] + np.floor(place * counts[layer]).astype(np.int64))
 
 
 def _noted(problem: SearchProblem, state: State) -> State:

@@ -12,7 +12,7 @@ from netdesign.errors import InputError
 from netdesign.search.archive import Archive
 from netdesign.search.population import Floats, Ints, Population, joined
 
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True, kw_only=True)

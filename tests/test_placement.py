@@ -197,8 +197,9 @@ def test_threads_do_not_change_a_search(plate):
 
 def test_the_memetic_engine_beats_the_plain_one_on_the_same_budget(box):
     plain, memetic = (
-        [run(box, engine, 60, 60, seed).hypervolume[-1] for seed in (1, 2, 3)] for engine in ("nsga2", "memetic")
+        [run(box, engine, 60, 60, seed).hypervolume[-1] for seed in range(1, 13)] for engine in ("nsga2", "memetic")
     )
+    # 0.172 and 0.192 over 24 seeds, one run scatters by 0.016 and 0.010: twelve differ by 3.5 of their sigma.
     assert np.mean(memetic) > np.mean(plain)
 
 

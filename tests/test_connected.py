@@ -139,3 +139,12 @@ def test_images_without_a_point_are_named_where_none_is_asked_for():
     said = why_infeasible(problem, replace(state, population=replace(state.population, genes=from_below)))
     assert "images see no object point" in said
     assert "fewer than 0" not in said
+
+
+def test_a_sigma_of_the_size_of_the_object_is_none():
+    """Two stations 0.05 degrees apart: sigma_px / f · 0.6 m / 0.0009 rad is 20 mm, a seventh of the plate's radius."""
+    exact = Exact(Problem.build(task_of(plate_scene(side=4), max_images=4, min_rays=2)))
+    assert exact.network(np.radians([[0.0, 70.0], [0.0, 70.05]])) == UNDETERMINED
+    wider = exact.network(np.radians([[0.0, 70.0], [0.0, 75.0]]))
+    assert not isinstance(wider, str)
+    assert wider.total is not None

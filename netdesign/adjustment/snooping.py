@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from netdesign.adjustment.problem import BundleProblem, null_space
-from netdesign.adjustment.solver import Solution, solve
+from netdesign.adjustment.solver import Solution, cost_parts, solve
 from netdesign.errors import InfeasibleError
 from netdesign.model.adjustment import Rejection
 from netdesign.model.arrays import Bools, Floats
@@ -22,6 +22,8 @@ from netdesign.photogrammetry.reliability import redundancy_matrices, w_statisti
 
 SUSPECT = 25.0  # squared whitened residual of the robust solution above which an image point is set aside
 ROUNDS = 30
+FAR = 10.0  # median squared whitened residual above which approximations are rough
+NARROWER = 25.0
 CONTROLLED = 3  # rays that an object point needs for its errors to be found
 
 
@@ -38,8 +40,7 @@ def cleaned(
     """
     original = problem.observations
     limit = float(chi2.isf(significance, 2))
-    robust = solve(problem, robust=True)
-    iterations = robust.iterations
+    robust, iterations = _from_afar(problem)
     if not sigma_known:
         for _ in range(3):
             guess = _robust_variance((robust.linearised.residual**2).sum(axis=1), robust.problem)
@@ -89,6 +90,28 @@ def cleaned(
         for k in np.flatnonzero(lost)
     )
     return replace(start, observations=original.select(keep)), rejections, dropped, iterations
+
+
+def _from_afar(problem: BundleProblem) -> tuple[Solution, int]:
+    """Return the robust solution and the iterations spent, approached with weights that narrow step by step.
+
+    Cauchy's weights look for the image points that agree to their sigma. From rough approximations, where none does,
+    they settle on those that happen to: a few of a weak image with a gross error among them. With sigmas as large as
+    the residuals are, all good points speak first (graduated non-convexity).
+    """
+    observations, iterations = problem.observations, 0
+    factor = float(np.median(cost_parts(problem, whitener(observations.covariance))[0]))
+    while factor > FAR:
+        wider = replace(observations, covariance=observations.covariance * factor)
+        try:
+            found = solve(replace(problem, observations=wider), robust=True)
+        except InfeasibleError:
+            break  # the narrow weights may get there all the same
+        iterations += found.iterations
+        problem = replace(found.problem, observations=observations)
+        factor /= NARROWER
+    robust = solve(problem, robust=True)
+    return robust, iterations + robust.iterations
 
 
 def _with_enough_rays(problem: BundleProblem, keep: Bools) -> Bools:

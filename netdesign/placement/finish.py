@@ -36,6 +36,7 @@ _TOO_LOOSE = (
 )
 LIMITED_DATUM = "fixed: the poses are error-free"
 COARSE = 25.0  # times the smallest f1 of a front: five times its sigma
+MEANINGLESS = 0.1  # share of the object's radius beyond which a sigma is no sigma
 SPARE = 1.5  # networks computed exactly per network kept: some fall to exact rays or to domination
 
 
@@ -133,7 +134,7 @@ class Exact:
         if not np.isfinite(limited.covariance).all():
             return "a point whose rays are parallel"
         # Limited propagation is blind to images that hang together by too little: such a network has no accuracy.
-        if total is None:
+        if total is None or _means_nothing(total, task.scene.targets.points):
             return UNDETERMINED
         precision = total if task.study.objectives.propagation == "total" else limited
         f1 = precision.mean_variance
@@ -173,6 +174,15 @@ class Exact:
         length = float(np.linalg.norm(np.diff(positions[order], axis=0), axis=1).sum())
         tour = Tour(order=np.arange(len(order)), length=length, space="workspace")
         return poses[order], tour, ()
+
+
+def _means_nothing(total: PointPrecision, points: Floats) -> bool:
+    """Tell whether a predicted sigma is so large a share of the object (m, 3) that linear propagation says nothing.
+
+    Such a network hangs together by rounding errors or by rays that all but coincide; its adjustment need not converge.
+    """
+    extent = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
+    return bool(np.sqrt(total.mean_variance) > MEANINGLESS * extent)
 
 
 def predicted(

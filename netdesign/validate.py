@@ -17,6 +17,7 @@ from netdesign.files.image_folder import complete_image_folder
 from netdesign.files.store import read_json, write_json
 from netdesign.imageset import worker_pool
 from netdesign.imaging.photograph import RendererName, Shoot
+from netdesign.model.figures import significant
 from netdesign.model.progress import Progress, silent
 from netdesign.model.task import Task
 from netdesign.proof import is_proved, photograph, prove_network
@@ -137,14 +138,19 @@ def _line(record: dict[str, Any]) -> str:
     predicted, achieved = record["predicted_rms_um"], record["achieved_rms_um"]
     rho = record["statistics"]["rho"]
     text = (
-        f"  {name}: {record['verdict']}, rms {achieved:.2f} um achieved, {predicted['limited']:.2f} limited and "
-        f"{predicted['total']:.2f} total at design, {predicted['used']:.2f} from the image points used; "
+        f"  {name}: {record['verdict']}, rms {_um(achieved)} um achieved, {_um(predicted['limited'])} limited and "
+        f"{_um(predicted['total'])} total at design, {_um(predicted['used'])} from the image points used; "
         f"rho {rho['value']:.3f} in [{rho['low']:.3f}, {rho['high']:.3f}]"
     )
     if "absolute" in record:
         absolute = record["absolute"]
         text += (
-            f"; in the robot's frame {absolute['achieved_rms_um']:.2f} um achieved, "
-            f"{absolute['predicted_rms_um']['design']:.2f} at design"
+            f"; in the robot's frame {_um(absolute['achieved_rms_um'])} um achieved, "
+            f"{_um(absolute['predicted_rms_um']['design'])} at design"
         )
     return text + (f"; {'; '.join(record['reasons'])}" if record["reasons"] else "")
+
+
+def _um(value: float) -> str:
+    """Three digits of a sigma in um, whatever the size of the part."""
+    return significant(value, 3)

@@ -6,6 +6,8 @@ from math import isfinite, log10, sqrt
 
 from markupsafe import Markup, escape
 
+from netdesign.reporting.words import finite
+
 
 @dataclass(frozen=True, kw_only=True)
 class IntervalRow:
@@ -127,7 +129,7 @@ def dot_chart(rows: Sequence[tuple[str, str, float, str]], unit: str) -> Markup:
     for index, (label, note, value, kind) in enumerate(rows):
         y = top + step * (index + 0.5)
         length = (width - left - right) * (value / high if isfinite(value) else 0)
-        words = f"{value:.2f} {unit}" if isfinite(value) else "undetermined"
+        words = f"{finite(value)} {unit}" if isfinite(value) else "undetermined"
         parts.append(
             f'<text class="label" x="0" y="{y:.1f}">{escape(label)}</text>'
             f'<text class="tick" x="0" y="{y + 12:.1f}">{escape(note)}</text>'

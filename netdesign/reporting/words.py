@@ -148,7 +148,7 @@ def design_gap(network: NetworkRecord) -> list[str]:
     points = network.adjustment["points"]
     sigma = np.array([item["sigma_apriori_mm"] for item in points], dtype=np.float64) * 1e3
     typical = np.nanmedian(sigma / (np.sqrt(np.diagonal(network.total, axis1=1, axis2=2)) / UM))
-    told = f"The image points that were measured promise {used:.2f} µm (P2), the design {design:.2f} µm (P1): "
+    told = f"The image points that were measured promise {finite(used)} µm (P2), the design {finite(design)} µm (P1): "
     if not DESIGN_GAP[0] < typical < DESIGN_GAP[1]:
         cause = (
             f"a typical point has {typical:.2g} times the sigma of the design, so the image noise assumed in [camera] "
@@ -193,8 +193,12 @@ def ellipsoid_words(factor: float, datum: str) -> str:
 
 
 def finite(value: float, digits: int = 2) -> str:
-    """Return a number for a table, a dash when it is undetermined."""
-    return f"{value:.{digits}f}" if np.isfinite(value) else "–"
+    """Return a number for a table with ``digits`` decimals, or as many as two digits need; a dash when undetermined."""
+    if not np.isfinite(value):
+        return "–"
+    if 0.0 < abs(value) < 1.0:  # a part of some millimetres has sigmas of hundredths of a micrometre
+        digits = max(digits, 1 - int(np.floor(np.log10(abs(value)))))
+    return f"{value:.{digits}f}"
 
 
 def stations(table: ViewpointsTable) -> str:

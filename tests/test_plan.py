@@ -1,6 +1,7 @@
 """Plans can be driven: exact poses, joints inside their limits, free legs, the length that was driven."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -226,3 +227,25 @@ def test_free_roll_against_inverse_kinematics_nearest_home(mount, gain):
         simple.append(nearest_neighbour_3opt(np.linalg.norm(wrapped, axis=2))[1])
         planned.append(plan_on(free, drawn).tour.length)
     assert np.mean(planned) <= (1 - gain) * np.mean(simple)
+
+
+def test_backing_off_from_the_part_may_be_the_only_way():
+    """Between two pillars: no way leads over joints that look at the part, one does over any joints."""
+    pillars = replace(
+        cell(),
+        margin=0.04,
+        obstacle_centres=[[0, 0, -0.11], [-0.3, 0.35, 0.3], [-0.3, -0.35, 0.3]],
+        obstacle_sizes=[[0.9, 0.9, 0.02], [0.04, 0.04, 0.8], [0.04, 0.04, 0.8]],
+    )
+    of_map = JointMap.of_arm(load_arm(pillars, sphere(radius=0.52), PART), sphere(radius=0.52), grid=64)
+    legs, meshes = Legs(of_map), of_map.arm.meshes
+    start = np.array([3.05, -2.42, -1.05, -1.99, 0.66, 1.26])
+    end = np.array([0.06, -1.05, 1.31, -1.18, -0.6, -1.55])
+    assert not meshes.contact(start)
+    assert not meshes.contact(end)
+    assert legs.contact(start, end)
+    assert legs._way(start, end, legs._mapped, 150) is None
+    found = legs.detour(start, end)
+    for a, b in itertools.pairwise([start, *found, end]):
+        assert ((a >= of_map.arm.placed.lower) & (a <= of_map.arm.placed.upper)).all()
+        assert not any(meshes.contact(a + share * (b - a)) for share in np.linspace(0, 1, 200))

@@ -1,21 +1,24 @@
 """Between two stations: is the straight joint line free, and if not, over which via points is it?"""
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
 from netdesign.model.arrays import Floats, Ints
-from netdesign.motion.collision import FREE, leg_state
+from netdesign.motion.collision import FREE, SIGHT, leg_state, states
 from netdesign.motion.joint_map import JointMap
+from netdesign.motion.kinematics import restarts
 from netdesign.motion.robot import Chain
 
 # 0.02 rad moves the tip of an outstretched UR10 by 26 mm: between two tests it stays within the margin of 20 mm.
 _STEP = 0.02
 _TURN = 2.0 * np.pi
-_ROADMAP = 150
+_NEAR, _ANYWHERE = 150, 400  # nodes of a roadmap over the map's joints, and over joints drawn anywhere
+_DRAWN = 20_000
 _NEIGHBOURS = 12
-_LAZY_ROUNDS = 200
+_LAZY_ROUNDS = 2  # per node
 _STOP = 0.1  # rad: what a via point costs on top of its way
 
 
@@ -26,6 +29,7 @@ class Legs:
         self._map = joint_map
         self._arm = joint_map.arm
         self._known: dict[bytes, str] = {}
+        self._free: Floats | None = None
 
     def contact(self, start: Floats, end: Floats) -> str:
         """Return what is touched on the straight line from start to end (r,), "" when it is free.
@@ -43,15 +47,22 @@ class Legs:
     def detour(self, start: Floats, end: Floats) -> Floats | None:
         """Return via points (k, r) of a free way from start to end (r,), None when none is found.
 
-        A lazy roadmap: nodes are free joints of a coarse subset of the map, each in the turns nearest to the leg,
-        joined to their nearest; the shortest way is tested leg by leg, legs that collide are taken out, and so on.
+        Over joints that look at the part, which are near, or over any: backing off from it may be the only way.
+        """
+        found = self._way(start, end, self._mapped, _NEAR)
+        return self._way(start, end, self._drawn, _ANYWHERE) if found is None else found
+
+    def _way(self, start: Floats, end: Floats, joints: Callable[[], Floats], most: int) -> Floats | None:
+        """Return the via points of the shortest free way over at most so many of some joints (c, r), None without one.
+
+        A lazy roadmap: nodes are free joints, each in the turns nearest to the leg, joined to their nearest; the
+        shortest way is tested leg by leg, legs that collide are taken out, and so on.
         Legs must be free for the capsules, which contain the meshes. Source: R. Bohlin, L. E. Kavraki, ICRA 2000.
         """
-        nodes = np.unique(
-            np.concatenate([self._candidates(share * start + (1.0 - share) * end) for share in (0.0, 0.5, 1.0)]), axis=0
-        )
+        middles = [share * start + (1.0 - share) * end for share in (0.0, 0.5, 1.0)]
+        nodes = np.unique(np.concatenate([self._turned(joints(), middle) for middle in middles]), axis=0)
         way = np.linalg.norm(nodes - start, axis=1) + np.linalg.norm(nodes - end, axis=1)
-        nodes = np.concatenate([[start, end], nodes[np.argsort(way, kind="stable")[:_ROADMAP]]])
+        nodes = np.concatenate([[start, end], nodes[np.argsort(way, kind="stable")[:most]]])
         distance = np.linalg.norm(nodes[:, None] - nodes, axis=2)
         near = np.argsort(distance, axis=1, kind="stable")[:, 1 : _NEIGHBOURS + 1]
         weights = np.zeros_like(distance)
@@ -62,7 +73,7 @@ class Legs:
         weights[0, 1] = weights[1, 0] = 0.0
         np.fill_diagonal(weights, 0.0)
         tested: set[tuple[int, int]] = set()
-        for _ in range(_LAZY_ROUNDS):
+        for _ in range(max(200, _LAZY_ROUNDS * len(nodes))):
             _, before = dijkstra(weights, indices=0, return_predecessors=True)
             path = [1]
             while path[-1] != 0 and before[path[-1]] >= 0:
@@ -85,16 +96,28 @@ class Legs:
             return False
         return not (self._arm.loose and self._arm.meshes.leg_contact(start, end, _STEP))
 
-    def _candidates(self, middle: Floats) -> Floats:
-        placed, found = self._arm.placed, []
+    def _turned(self, joints: Floats, middle: Floats) -> Floats:
+        """Return joints (c, r) in the turns nearest to others (r,), as far as the limits allow."""
+        placed = self._arm.placed
+        turned = joints + np.where(placed.wraps, _TURN * np.rint((middle - joints) / _TURN), 0.0)
+        inside = (turned >= placed.lower) & (turned <= placed.upper)
+        return np.ascontiguousarray(np.where(inside, turned, joints))
+
+    def _mapped(self) -> Floats:
+        """Return free joints (c, r) of a coarse subset of the map."""
+        found = []
         for arrays in self._map.shells:
             step, rolls = max(arrays.state.shape[1] // 12, 1), max(len(arrays.state) // 4, 1)
             free = arrays.state[::rolls, ::step, ::step] == FREE
             found.append(arrays.joints[::rolls, ::step, ::step][free])
-        joints = np.concatenate(found).astype(np.float64)
-        turned = joints + np.where(placed.wraps, _TURN * np.rint((middle - joints) / _TURN), 0.0)
-        inside = (turned >= placed.lower) & (turned <= placed.upper)
-        return np.ascontiguousarray(np.where(inside, turned, joints))
+        return np.concatenate(found).astype(np.float64)
+
+    def _drawn(self) -> Floats:
+        """Return free joints (c, r) drawn evenly over the limits; whether the view is blocked does not matter."""
+        if self._free is None:
+            joints = restarts(self._arm.placed, _DRAWN, seed=3)
+            self._free = joints[np.isin(states(self._arm.body, joints), (FREE, SIGHT))]
+        return self._free
 
 
 def turned_towards(home: Floats, joints: Floats, chain: Chain) -> Floats:

@@ -130,27 +130,41 @@ class _Flags(Flags):
     """Options of a kernel; what it calls inherits only those that matter to it.
 
     Numba keeps an ``empty`` or ``max`` for every set of options that it was compiled under, wrappers and threads
-    included, and compares sixty options for every function that a call might mean.
+    included. Whether a kernel counts references is its own affair as well: a part says so itself, and the rest is too
+    small for it to matter.
     """
 
     __slots__ = ()
 
     def copy(self) -> Flags:
         """Return what is inherited, one object for each choice of them."""
-        inherited = _Flags()
-        for name in ("nrt", "fastmath", "error_model"):
+        inherited = _Inherited()
+        inherited.nrt = True
+        for name in ("fastmath", "error_model"):
             setattr(inherited, name, getattr(self, name))
         return _inherited.setdefault(inherited.summary(), inherited)
-
-    def __eq__(self, other: object) -> bool:
-        return self is other or super().__eq__(other)
 
     def __hash__(self) -> int:
         return _HASH
 
+    def __eq__(self, other: object) -> bool:
+        return bool(super().__eq__(other))
+
+
+class _Inherited(_Flags):
+    """One of few: numba compares sixty options for every function that a call might mean."""
+
+    __slots__ = ()
+
+    def __hash__(self) -> int:
+        return _HASH
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (not isinstance(other, _Inherited) and bool(super().__eq__(other)))
+
 
 _HASH = hash(Flags())  # numba's hash does not look at the values
-_inherited: dict[str, Flags] = {}
+_inherited: dict[str, _Inherited] = {}
 
 
 class _EntryCompiler(Compiler):

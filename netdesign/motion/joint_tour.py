@@ -227,8 +227,8 @@ def directions_tour(directions):  # type: ignore[no-untyped-def]
     return tour
 
 
-@entry()
-def options_tour(
+@part()
+def _options_tour(
     options: Floats, count: Ints, directions: Floats, label: Ints, barred: Floats, law: Floats, timed: bool, work: Work
 ) -> float:
     """Return the search's joint tour of n >= 1 stations whose options (n, r, K) are known, without dwell.
@@ -237,6 +237,15 @@ def options_tour(
     """
     tour = directions_tour(directions)
     length: float = joint_tour(options, count, label, barred, law, timed, tour, np.int64(_ROUNDS), work)
+    return length
+
+
+@entry()
+def options_tour(
+    options: Floats, count: Ints, directions: Floats, label: Ints, barred: Floats, law: Floats, timed: bool, work: Work
+) -> float:
+    """Return the search's joint tour of n >= 1 stations whose options (n, r, K) are known, without dwell."""
+    length: float = _options_tour(options, count, directions, label, barred, law, timed, work)
     return length
 
 
@@ -278,7 +287,7 @@ def network_tour(arrays, law, timed, dwell, viewpoints, own, work):  # type: ign
     refused = n - kept
     length = 0.0
     if kept > 1:
-        length = options_tour(
+        length = _options_tour(
             own.options[:kept], own.count[:kept], own.directions[:kept], own.label, own.barred, law, timed, work
         )
     return (length + dwell * n if timed else length), refused

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from netdesign.errors import InfeasibleError, InputError
+from netdesign.files.design_json import read_design
 from netdesign.files.store import plain, read_json
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.figures import significant
@@ -82,7 +83,7 @@ def front_rows(run: Path) -> list[FrontRow]:
     Raises:
         InputError: RUN/design.json is missing or not a design.
     """
-    design = read_design(run)
+    design = read_design(run / "design.json")
     networks = design["networks"]
     best = networks[_knee(design, np.ones(len(networks), dtype=bool))]["id"]
     unit = design["objectives"][1]["unit"]
@@ -125,7 +126,7 @@ def choose(
     for name, limit in (("--max-sigma-um", max_sigma_um), ("--max-images", max_images), ("--max-tour", max_tour)):
         if limit is not None and not (limit > 0 and np.isfinite(limit)):
             raise InputError(f"{name}: expected a positive number, found {limit:g}")
-    design = read_design(run)
+    design = read_design(run / "design.json")
     objectives, networks = objectives_of(design), design["networks"]
     task = open_run(run)
     own = task.study.requirements
@@ -163,18 +164,6 @@ def choose(
         requirements=asked,
         warnings=_warnings(networks[index], row, asked),
     )
-
-
-def read_design(run: Path) -> dict[str, Any]:
-    """Return the content of RUN/design.json.
-
-    Raises:
-        InputError: missing, not a design, or without networks.
-    """
-    design = read_json(run / "design.json", "design")
-    if not design.get("networks"):
-        raise InputError(f"{run / 'design.json'}: expected at least one network, found none")
-    return design
 
 
 def objectives_of(design: dict[str, Any]) -> Floats:

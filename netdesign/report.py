@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from netdesign.choose import choose, poses_of, read_design
+from netdesign.choose import choose, poses_of
 from netdesign.errors import InfeasibleError
-from netdesign.files.design_json import vias_of
+from netdesign.files.design_json import read_design, vias_of
 from netdesign.files.store import read_json, write_bytes, write_text
 from netdesign.files.study_text import study_toml
 from netdesign.model.arrays import Bools, Floats
@@ -95,7 +95,7 @@ def read_run(run: Path) -> RunRecord:
     Raises:
         InputError: ``run`` is not a run directory with a design, or a file in it is damaged.
     """
-    task, design = open_run(run), read_design(run)
+    task, design = open_run(run), read_design(run / "design.json")
     sight = Sight(task.scene, task.camera, task.limits)
     recommended, reason = _recommended(run)
     chain = None if task.cell is None else load_chain(task.cell)

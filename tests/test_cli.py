@@ -1,5 +1,6 @@
 """The command line: one clear line and the exit status of the contract."""
 
+import json
 import os
 import subprocess
 import sys
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from netdesign.choose import front
 from netdesign.environment import prepare_environment
 from netdesign.errors import InputError
 from netdesign.export import export
 from netdesign.files.design_json import find_network
+from netdesign.files.stations import stations_table
 from netdesign.run_folder import open_run
 from tests.runs import ring_run
 
@@ -113,3 +116,27 @@ def test_the_glb_of_a_study_without_a_robot_holds_part_and_stations(tmp_path):
     np.testing.assert_allclose(scene.geometry["part"].bounds[1], [x.max(), z.max(), -y.min()], atol=1e-6)
     with pytest.raises(InputError, match=r"urscript: expected a study with a \[robot\] table"):
         export(tmp_path / "run", 0, "urscript", tmp_path / "program.script")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda d: d.pop("networks"), "expected at least one network, found none"),
+        (lambda d: d["networks"][1].pop("world_from_cam_mm"), r"networks\[1\]: .* found no world_from_cam_mm"),
+        (lambda d: d["networks"][0].update(world_from_cam_mm="x"), r"networks\[0\]: expected n poses 4x4"),
+        (lambda d: d["networks"][0]["viewpoints_deg"].pop(), r"networks\[0\]: expected n poses 4x4"),
+    ],
+)
+def test_a_design_json_that_is_not_whole_is_one_line(tmp_path, spoil, says):
+    ring_run(tmp_path / "run")
+    path = tmp_path / "run/design.json"
+    content = json.loads(path.read_text())
+    spoil(content)
+    path.write_text(json.dumps(content))
+    for read in (
+        lambda: export(tmp_path / "run", 0, "csv", tmp_path / "out.csv"),
+        lambda: stations_table(f"{path}#0", tmp_path),
+        lambda: front(tmp_path / "run"),
+    ):
+        with pytest.raises(InputError, match=says):
+            read()

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from netdesign import choose
 from netdesign.errors import InfeasibleError, InputError
+from netdesign.files.design_json import read_design
 from netdesign.placement import decide
 from netdesign.placement.distances import network_total_error
 from tests.runs import ring_run
@@ -128,7 +129,7 @@ def test_a_distance_is_judged_by_the_full_covariance(tmp_path):
     (asked,) = choice.requirements
     assert 0 < asked["value"] <= 60.0
     # The same from the joint covariance written out as a quadratic form.
-    design = choose.read_design(tmp_path / "run")
+    design = read_design(tmp_path / "run/design.json")
     total = network_total_error(task, choose.poses_of(design["networks"][choice.network]))
     points = task.scene.targets.points
     row = np.zeros(3 * len(points))

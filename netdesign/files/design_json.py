@@ -17,6 +17,11 @@ MM, UM = 1e-3, 1e-6
 F1 = {"mean_variance": ("mean_variance", "mm^2", MM**2), "max_sigma": ("max_sigma", "um", UM)}
 F2 = {"workspace": ("tour_workspace", "mm", MM), "joint": ("tour_joint", "rad", 1.0), "time": ("tour_time", "s", 1.0)}
 
+NEEDED = (
+    "id", "objectives", "viewpoints_deg", "world_from_cam_mm", "joints_rad", "rms_sigma_um", "max_sigma_um",
+    "bound_ratio", "rays", "sigma_um",
+)  # fmt: skip
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedNetwork:
@@ -70,13 +75,40 @@ def write_design(path: Path, task: Task, design: Design) -> None:
     write_json(path, "design", payload, task.sha256)
 
 
+def read_design(path: Path) -> dict[str, Any]:
+    """Return the content of a design.json whose networks are whole: what reads it further need not look again.
+
+    Raises:
+        InputError: missing, not a design, without networks, or a network lacks a key or its poses.
+    """
+    content = read_json(path, "design")
+    networks = content.get("networks")
+    if not isinstance(networks, list) or not networks:
+        raise InputError(f"{path}: expected at least one network, found none")
+    for place, entry in enumerate(networks):
+        missing = [key for key in NEEDED if not isinstance(entry, dict) or key not in entry]
+        if missing:
+            raise InputError(f"{path}: networks[{place}]: expected {', '.join(NEEDED)}, found no {missing[0]}")
+        try:
+            poses = np.array(entry["world_from_cam_mm"], dtype=np.float64)
+            viewpoints = np.array(entry["viewpoints_deg"], dtype=np.float64)
+        except (TypeError, ValueError):
+            poses, viewpoints = np.zeros(0), np.zeros(0)
+        if poses.shape != (len(viewpoints), 4, 4) or viewpoints.shape != (len(poses), 2) or not len(poses):
+            raise InputError(
+                f"{path}: networks[{place}]: expected n poses 4x4 in world_from_cam_mm and n pairs in viewpoints_deg,"
+                " found something else"
+            )
+    return content
+
+
 def read_networks(run: Path) -> dict[int, PlannedNetwork]:
     """Return the networks of RUN/design.json by id.
 
     Raises:
         InputError: there is no design.json, or it is not one.
     """
-    content = read_json(run / "design.json", "design")
+    content = read_design(run / "design.json")
     networks = {}
     for entry in content["networks"]:
         world_from_cam = np.array(entry["world_from_cam_mm"], dtype=np.float64)

@@ -13,6 +13,7 @@ import numpy as np
 from netdesign.errors import InputError
 from netdesign.files.colmap_text import read_images
 from netdesign.files.csv_table import numbers, table_rows
+from netdesign.files.design_json import read_design
 from netdesign.files.packages import resolve_path
 from netdesign.files.robot_program import stations_csv
 from netdesign.files.store import read_json
@@ -85,7 +86,7 @@ def _of_json(path: Path, network: str) -> Floats:
     if kind == "netdesign/program/1":
         found = [item["world_from_cam_mm"] for item in read_json(path, "program")["stations"]]
     else:
-        networks = {str(item["id"]): item for item in read_json(path, "design")["networks"]}
+        networks = {str(item["id"]): item for item in read_design(path)["networks"]}
         if not network and len(networks) == 1:
             network = next(iter(networks))
         if network not in networks:

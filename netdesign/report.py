@@ -12,9 +12,9 @@ from netdesign.files.store import read_json, write_bytes, write_text
 from netdesign.files.study_text import study_toml
 from netdesign.model.arrays import Bools, Floats
 from netdesign.model.task import Task
+from netdesign.motion.driven import leg_lengths
 from netdesign.motion.joint_map import JointMap
 from netdesign.motion.joint_tour import chain_law
-from netdesign.motion.plan import leg_lengths
 from netdesign.motion.robot import Chain, load_chain
 from netdesign.photogrammetry.limited_error import limited_covariance
 from netdesign.photogrammetry.precision import sighting_sigma

@@ -10,13 +10,14 @@ from netdesign.errors import InputError
 from netdesign.files.robot_program import urscript
 from netdesign.model.frames import look_at, sphere_directions
 from netdesign.motion.cell import load_arm
+from netdesign.motion.driven import leg_lengths, shorter_order
 from netdesign.motion.exact_tour import exact_joint_tour
 from netdesign.motion.joint_map import JointMap
 from netdesign.motion.joint_tour import law_of
 from netdesign.motion.kinematics import base_from_flange
 from netdesign.motion.legs import Legs
 from netdesign.motion.options import exact_options
-from netdesign.motion.plan import leg_lengths, plan_on
+from netdesign.motion.plan import plan_on
 from netdesign.motion.program import program_of, sampled
 from netdesign.motion.timing import leg_law, leg_time
 from netdesign.motion.tour import nearest_neighbour_3opt
@@ -249,3 +250,20 @@ def test_backing_off_from_the_part_may_be_the_only_way():
     for a, b in itertools.pairwise([start, *found, end]):
         assert ((a >= of_map.arm.placed.lower) & (a <= of_map.arm.placed.upper)).all()
         assert not any(meshes.contact(a + share * (b - a)) for share in np.linspace(0, 1, 200))
+
+
+def test_the_order_is_the_best_once_the_via_points_are_known():
+    """By brute force over all orders of five stations whose second leg would need a long way round."""
+    of_map = joint_map()
+    joints = plan_on(of_map, reachable_viewpoints(of_map, 5, 21)).tour.joints
+    legs, law = Legs(of_map), law_of(of_map.arm)
+    assert not any(legs.contact(*pair) for pair in itertools.combinations(joints, 2))
+    vias = {1: joints[1:2] + 1.5}
+    lengths = leg_lengths(joints, vias, law, False)
+    pairs = {(i, j): np.linalg.norm(joints[i] - joints[j]) for i in range(5) for j in range(5)}
+    pairs[1, 2] = pairs[2, 1] = lengths[1]
+    best = min(sum(pairs[pair] for pair in itertools.pairwise(way)) for way in itertools.permutations(range(5)))
+    order = shorter_order(legs, joints, vias, law, False)
+    assert best < lengths.sum() - 0.1
+    assert sum(pairs[pair] for pair in itertools.pairwise(order.tolist())) == pytest.approx(best, abs=1e-9)
+    np.testing.assert_array_equal(shorter_order(legs, joints, {}, law, False), np.arange(5))

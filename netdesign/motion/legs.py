@@ -29,6 +29,7 @@ class Legs:
         self._map = joint_map
         self._arm = joint_map.arm
         self._known: dict[bytes, str] = {}
+        self._ways: dict[bytes, Floats | None] = {}
         self._free: Floats | None = None
 
     def contact(self, start: Floats, end: Floats) -> str:
@@ -47,10 +48,15 @@ class Legs:
     def detour(self, start: Floats, end: Floats) -> Floats | None:
         """Return via points (k, r) of a free way from start to end (r,), None when none is found.
 
-        Over joints that look at the part, which are near, or over any: backing off from it may be the only way.
+        Over joints that look at the part, which are near, or over any: backing off from it may be the only way. The way
+        back is the same.
         """
-        found = self._way(start, end, self._mapped, _NEAR)
-        return self._way(start, end, self._drawn, _ANYWHERE) if found is None else found
+        key, back = start.tobytes() + end.tobytes(), end.tobytes() + start.tobytes()
+        if key not in self._ways:
+            found = self._way(start, end, self._mapped, _NEAR)
+            found = self._way(start, end, self._drawn, _ANYWHERE) if found is None else found
+            self._ways |= {key: found, back: None if found is None else found[::-1]}
+        return self._ways[key]
 
     def _way(self, start: Floats, end: Floats, joints: Callable[[], Floats], most: int) -> Floats | None:
         """Return the via points of the shortest free way over at most so many of some joints (c, r), None without one.

@@ -6,7 +6,7 @@
 3. The best options of every station, in all turns inside the limits, take part in the same alternation without the
    modulo: what comes out can be driven.
 4. Every leg is tested; a colliding one is barred for its pair of branches and turns, and step 3 is repeated. Where
-   that does not help, via points are put in.
+   that does not help, via points are put in, and the order is the best with them.
 """
 
 import itertools
@@ -21,6 +21,7 @@ from netdesign.model.results import Tour
 from netdesign.model.scene import Part
 from netdesign.model.stations import ViewingSphere
 from netdesign.model.task import RobotCell
+from netdesign.motion.driven import leg_lengths, shorter_order, via_points
 from netdesign.motion.exact_tour import exact_joint_tour
 from netdesign.motion.joint_map import JointMap
 from netdesign.motion.joint_tour import NO_TURN, directions_tour, joint_tour, law_of, legs_along, work_for
@@ -126,7 +127,13 @@ def plan_on(
     order, joints, notes = _repaired(modulo, starts, legs, arm.placed.lower, arm.placed.upper)
     if arm.cell.home is not None:
         joints = turned_towards(np.array(arm.cell.home), joints, arm.placed)
-    vias, more, refused = _vias(legs, joints, order)
+    vias, more, refused = via_points(legs, joints, order)
+    if vias and not refused:
+        again = shorter_order(legs, joints, vias, law_of(arm), timed)
+        home = None if arm.cell.home is None else np.array(arm.cell.home)
+        if home is None or not home_legs(legs, home, joints[again], order[again])[1]:
+            order, joints = order[again], joints[again]
+            vias, more, refused = via_points(legs, joints, order)
     if arm.cell.home is not None and not refused:
         from_home, refused = home_legs(legs, np.array(arm.cell.home), joints, order)
         more += from_home
@@ -141,25 +148,6 @@ def plan_on(
         viewpoints=viewpoints[order],
         warnings=(*notes, *more),
     )
-
-
-def leg_lengths(joints: Floats, vias: dict[int, Floats], law: Floats, timed: bool) -> Floats:
-    """Return the cost (n - 1,) of driving joints (n, r) in order over the via points, leg by leg, without dwell."""
-    r = joints.shape[1]
-    lengths = np.zeros(len(joints) - 1)
-    for leg in range(len(joints) - 1):
-        change = np.abs(
-            np.diff(
-                np.concatenate([joints[leg : leg + 1], vias.get(leg, joints[:0]), joints[leg + 1 : leg + 2]]), axis=0
-            )
-        )
-        if not timed:
-            lengths[leg] = np.sqrt(((law[0, :r] * change) ** 2).sum(axis=1)).sum()
-            continue
-        longest, hardest = (change * law[1, :r]).max(axis=1), (change * law[2, :r]).max(axis=1)
-        ramp = hardest / np.where(longest > 0, longest, 1.0)
-        lengths[leg] = np.where(longest**2 >= hardest, longest + ramp, 2.0 * np.sqrt(hardest)).sum()
-    return lengths
 
 
 def _plain(law: Floats) -> Floats:
@@ -270,23 +258,3 @@ def _distances(joints: Floats, labels: Ints, problem: _Problem) -> Floats:
     cost = cost + problem.barred[stations[:, None], stations, labels[:, None], labels]
     np.fill_diagonal(cost, 0.0)
     return np.asarray(cost)
-
-
-def _vias(
-    legs: Legs, joints: Floats, order: Ints
-) -> tuple[dict[int, Floats], tuple[str, ...], tuple[tuple[int, str], ...]]:
-    """Return via points of the legs that still collide, what is to be said, and stations that cannot be left."""
-    vias: dict[int, Floats] = {}
-    notes: list[str] = []
-    refused: list[tuple[int, str]] = []
-    for leg in range(len(joints) - 1):
-        contact = legs.contact(joints[leg], joints[leg + 1])
-        if not contact:
-            continue
-        found = legs.detour(joints[leg], joints[leg + 1])
-        if found is None:
-            refused.append((int(order[leg]), f"no free way to the next station: {contact}"))
-        else:
-            vias[leg] = found
-            notes.append(f"leg {leg + 1} goes over {len(found)} via point(s): on the straight line {contact}")
-    return vias, tuple(notes), tuple(refused)

@@ -79,6 +79,37 @@ print(caller(1.0), twice(3.0), sum(twice.stats.cache_hits.values()))
     assert said == [["2.5", "6.0", "0"], ["2.25", "6.0", "1"]]
 
 
+def test_a_kernel_is_loaded_without_the_declarations_that_compiling_needs(tmp_path):
+    """It allocates, returns arrays and tuples, and raises; the same from the compiler and from the disk."""
+    kernel = """
+import sys
+import numpy as np
+from netdesign.model.compiled import entry
+
+@entry()
+def kernel(x):
+    if x.shape[0] == 0:
+        raise ValueError("empty")
+    found = np.zeros((2, x.shape[0]))
+    found[0] = np.sqrt(x)
+    return found, x.sum()
+
+found, total = kernel(np.array([4.0, 9.0]))
+try:
+    kernel(np.zeros(0))
+except ValueError as error:
+    print(found[0].tolist(), total, error, "numba.typed.typeddict" in sys.modules)
+"""
+    (tmp_path / "kernel.py").write_text(kernel, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, "-B", "kernel.py"]
+    said = [
+        subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    ]
+    assert said == [f"[2.0, 3.0] 13.0 empty {compiled}\n" for compiled in (True, False)]
+
+
 def test_a_part_is_the_same_function_from_python_and_compiled():
     @part()
     def squared(x):

@@ -21,8 +21,10 @@ from typing import Any
 
 import numpy as np
 from numba import jit, njit
+from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
+from numba.core.runtime import rtsys
 from numba.core.target_extension import jit_registry, target_registry
 from numba.extending import register_jitable
 
@@ -43,6 +45,8 @@ def entry(*, fastmath: frozenset[str] | bool = False, nogil: bool = False) -> Ca
             function
         )
         _sources[kernel] = _dependencies(function)
+        if getattr(kernel, "_cache", None).__class__ is FunctionCache:
+            kernel._cache = _Cache(function)
         index: Any = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
         if hasattr(index, "_source_stamp"):
             index._source_stamp = "\n".join(sorted(_sources[kernel]))
@@ -95,6 +99,19 @@ def _contents(path: str) -> str:
         return f"{Path(path).name} {hashlib.sha256(Path(path).read_bytes()).hexdigest()}"
     except OSError:  # typed into an interpreter: numba does not keep it either
         return path
+
+
+class _Cache(FunctionCache):
+    """Machine code on disk, loaded without numba's thousands of declarations: those are for compiling.
+
+    They also make LAPACK and hash functions known: a kernel that calls those needs them.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the compiled kernel of a signature, None when it is not there."""
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
 
 class _EntryLibrary(JITCodeLibrary):

@@ -96,6 +96,11 @@ def test_tags_lie_on_faces_and_do_not_overlap(study):
             r"camera\.distortion: expected a list of 4, found one of 5",
         ),
         ("[camera]", '[objectives]\nmotion = "joint"\n[camera]', r"joint needs a \[robot\] table"),
+        (
+            "[part]",
+            'robot = "ur10"\n[part]',
+            r"robot: expected a table \(\[robot\] or key = value in braces\), found 'ur10'",
+        ),
     ],
 )
 def test_mistakes(study, old, new, says):

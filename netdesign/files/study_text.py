@@ -75,6 +75,8 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     context = problem.get("ctx", {})
     if problem["type"] in ("tuple_type", "list_type"):
         message = "a list in brackets"
+    elif problem["type"] in ("model_type", "dict_type"):
+        message = f"a table ([{place}] or key = value in braces)"
     elif problem["type"] in ("too_long", "too_short"):
         wanted = context.get("max_length", context.get("min_length"))
         return f"{place}: expected a list of {wanted}, found one of {context.get('actual_length')}{more}"

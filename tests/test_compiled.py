@@ -1,5 +1,6 @@
 """Compiled kernels: the cache notices every edit of a part, of its file or of a constant; numba stays as it was."""
 
+import ast
 import os
 import subprocess
 import sys
@@ -156,3 +157,24 @@ def test_functions_of_numba_that_a_kernel_calls_serve_others_too():
         wrong(3)
     assert dict(jit_registry) == before
     assert njit(lambda count: np.ones(count).sum())(5) == 5.0
+
+
+NEEDS_DECLARATIONS = {"linalg", "dot", "vdot", "hash", "dict", "set"}
+
+
+def test_no_kernel_calls_what_is_not_there_when_it_is_loaded_from_the_disk():
+    """LAPACK, BLAS and hashes are known from numba's declarations only: machine code would jump to address 0."""
+    kernels = 0
+    for path in (ROOT / "netdesign").rglob("*.py"):
+        for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(function, ast.FunctionDef) or not any(
+                getattr(getattr(decorator, "func", None), "id", None) in ("entry", "part")
+                for decorator in function.decorator_list
+            ):
+                continue
+            kernels += 1
+            for node in ast.walk(function):
+                assert not isinstance(node, ast.MatMult), f"{path.name}: {function.name} multiplies matrices by BLAS"
+                name = getattr(node, "attr", getattr(node, "id", None))
+                assert name not in NEEDS_DECLARATIONS, f"{path.name}: {function.name} uses {name}"
+    assert kernels > 50

@@ -45,7 +45,8 @@ def study_of(case, folder):
 def run_case(path, runs):
     """Run one case and return its result."""
     case = tomllib.loads(path.read_text(encoding="utf-8")) | {"name": path.stem}
-    run = design_study(study_of(case, runs), runs / path.stem, seed=None, resume=True, threads=2).run
+    # Anew every time: a finished run may be that of an earlier engine.
+    run = design_study(study_of(case, runs), runs / path.stem, seed=None, resume=False, threads=2).run
     front = json.loads((run / "design.json").read_text(encoding="utf-8"))
     result = {
         "case": path.stem,

@@ -81,8 +81,8 @@ def read_photo_set(folder: Path, sigma_px: float | None, progress: Progress, ref
     names = tuple(path.name for path in photos)
     if seen.sum() < 2:
         raise InfeasibleError(
-            f"{folder}: expected tags in at least 2 photographs, found them in {int(seen.sum())} of {len(photos)}; "
-            f"{len(refused)} tag(s) were refused{': ' + refused[0] if refused else ''}"
+            f"{folder}: expected tags of {targets.family} in at least 2 photographs, found them in {int(seen.sum())} of"
+            f" {len(photos)}; {len(refused)} tag(s) were refused{': ' + refused[0] if refused else ''}"
         )
     notes = _tone_notes(tone, stated)
     if not seen.all():

@@ -129,7 +129,7 @@ def test_bad_image_sets_are_one_line(tmp_path):
 
     for name in ("a.png", "b.png"):
         (folder / "images" / name).write_bytes(png_bytes(np.full((2048, 2448), 128, np.uint8)))
-    with pytest.raises(InfeasibleError, match="expected tags in at least 2 photographs, found them in 0 of 2"):
+    with pytest.raises(InfeasibleError, match="tags of tag36h11 in at least 2 photographs, found them in 0 of 2"):
         adjust_folder(folder)
     (folder / "camera.toml").write_text(CAMERA_TOML.replace("size_mm = 20", ""))
     with pytest.raises(InputError, match=r"targets\.size_mm"):

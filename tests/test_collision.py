@@ -170,6 +170,33 @@ def test_what_the_base_stands_on_is_no_obstacle_for_the_links_above_it():
     assert (states(loaded.body, restarts(loaded.placed, 300, seed=5)) == FREE).any()
 
 
+def test_the_second_link_may_be_near_what_the_base_stands_on_but_never_touch_it():
+    sizes = np.array([[0.9, 0.9, 0.02], [0.8, 0.8, 0.6]])  # a pedestal so wide that the upper arm can dip into it
+    wide = replace(cell(), margin=0.1, obstacle_sizes=sizes)
+    loaded = load_arm(wide, sphere(), BOX)
+    assert loaded.body.mounting[1] == TOUCH
+    pedestal = coal.CollisionObject(coal.Box(*sizes[1]), np.eye(3), np.asarray(wide.obstacle_centres[1]))
+    (shape,) = [shape for shape in loaded.placed.shapes if shape.link == 2]
+    upper = coal.CollisionObject(_bvh(shape))
+    q = restarts(loaded.placed, 300, seed=7)
+    q[:, 2:] = [0.5, -1.0, 0.5, 0.0]
+    touching = np.zeros(len(q), np.bool_)
+    for row, pose in enumerate(link_world_poses(loaded, q)):
+        upper.setTransform(coal.Transform3s(pose[1][:3, :3], pose[1][:3, 3]))
+        touching[row] = coal.collide(upper, pedestal, coal.CollisionRequest(), coal.CollisionResult()) > 0
+    body = loaded.body
+    own = body.capsule_link == 2  # only the upper arm: the rest of the arm must not answer for it
+    alone = body._replace(
+        capsules=np.ascontiguousarray(body.capsules[own]), capsule_link=body.capsule_link[own], camera_parts=0,
+        pairs=body.pairs[:0], sight=body.sight[:0],
+    )  # fmt: skip
+    told = states(alone, q) != FREE  # an arm that low may be in the part as well
+    assert touching.sum() > 20
+    assert told[touching].all()
+    assert all(loaded.meshes.contact(joints) for joints in q[touching])
+    assert not told.all()  # nearer than the margin it is at every angle
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -13,13 +13,14 @@ from netdesign.model.study import Study
 from netdesign.model.task import Task
 from netdesign.photogrammetry.collinearity import project_with_jacobians
 from netdesign.photogrammetry.limited_error import limited_covariance
-from netdesign.photogrammetry.precision import sighting_sigma
+from netdesign.photogrammetry.precision import corner_sigma, sighting_sigma
 from netdesign.photogrammetry.visibility import Sight, sightings
 from netdesign.placement.bound import Certificate, lower_bounds
 from netdesign.placement.encoding import Chromosomes
 from netdesign.placement.information import quadratic_forms
 from netdesign.placement.optimal_design import optimal_weights
 from netdesign.placement.problem import Problem
+from netdesign.placement.sighting_weight import tangent, weight_table
 from netdesign.search.engine import run
 from tests.scenes import CAMERA, LIMITS, box_scene, plate_scene, sphere
 from tests.test_visibility import bracket_scene
@@ -315,3 +316,29 @@ def test_a_point_that_one_candidate_sees_does_not_break_the_optimum(seed):
     assert np.isfinite(weights).all()
     assert (weights >= 0).all()
     assert weights.sum() == pytest.approx(1.0)
+
+
+@settings(max_examples=200, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_tangent_of_the_weight_lies_above_it_all_over_a_cell(seed):
+    rng = np.random.default_rng(seed)
+    camera = replace(
+        CAMERA, corner_noise=CornerNoise(k=float(rng.uniform(0.5, 5)), floor_px=float(rng.uniform(0, 0.02)))
+    )
+    size, incidence = 0.02, np.radians(65)
+    table = weight_table(camera, size, (0.3, 1.0), incidence)
+    turned, ratio = float(np.exp(rng.uniform(-8, -1.5))), float(np.exp(rng.uniform(-8, -1.5)))
+    cosine = float(rng.uniform(np.cos(incidence), 1.0))
+    depth = float(rng.uniform(0.3 * np.exp(ratio), 1.0))
+    found = tangent(depth, depth * np.exp(-ratio), cosine, turned, 0.0, 0.0, table)
+    value, by_cosine, by_depth, rest = found
+    away = rng.uniform(-1.0, 1.0, (400, 2)) * [turned, ratio]
+    away[:4] = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * [turned, ratio]
+    place = np.column_stack([cosine + away[:, 0], depth * np.exp(away[:, 1])])
+    there = (place[:, 0] <= 1.0) & (place[:, 0] >= np.cos(incidence)) & (place[:, 1] <= 1.0)
+    if by_cosine == by_depth == 0.0:  # the largest value, at the nearest depth and the steepest view
+        there &= away[:, 1] >= -ratio
+    edge = float(np.sqrt(camera.focal_px.prod())) * size / place[:, 1]
+    weight = camera.focal_px.max() ** 2 / corner_sigma(camera, edge, np.arccos(np.minimum(place[:, 0], 1.0))) ** 2
+    above = value + by_cosine * away[:, 0] + by_depth * away[:, 1] + rest
+    assert (weight[there] <= above[there] * (1.0 + 1e-9)).all()

@@ -267,3 +267,29 @@ def test_the_order_is_the_best_once_the_via_points_are_known():
     assert best < lengths.sum() - 0.1
     assert sum(pairs[pair] for pair in itertools.pairwise(order.tolist())) == pytest.approx(best, abs=1e-9)
     np.testing.assert_array_equal(shorter_order(legs, joints, {}, law, False), np.arange(5))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_order_with_via_points_is_the_best_of_all_orders(seed):
+    """Against all orders, where most straight legs collide: those with known via points or without a contact count."""
+    rng = np.random.default_rng(seed)
+    joints, law = rng.uniform(-2, 2, (6, 3)), np.ones((4, 3))
+    blocked = {pair for pair in itertools.combinations(range(6), 2) if rng.random() < 0.4} | {(1, 2), (3, 4)}
+
+    class Fenced:
+        def contact(self, start, end):
+            ends = [int(np.flatnonzero((joints == joint).all(axis=1))[0]) for joint in (start, end)]
+            return "a fence" if tuple(sorted(ends)) in blocked else ""
+
+    vias = {leg: rng.uniform(-2, 2, (1, 3)) for leg in range(5) if (leg, leg + 1) in blocked}
+    driven = leg_lengths(joints, vias, law, False)
+
+    def length(order):
+        total = 0.0
+        for pair in itertools.pairwise(order):
+            i, j = sorted(pair)
+            total += driven[i] if j == i + 1 else np.inf if (i, j) in blocked else np.linalg.norm(joints[i] - joints[j])
+        return total
+
+    best = min(length(order) for order in itertools.permutations(range(6)))
+    assert length(shorter_order(Fenced(), joints, vias, law, False)) == pytest.approx(best, rel=1e-12)
